@@ -1,0 +1,1 @@
+"""Learning to act in worlds that cannot be fully seen: action-conditioned HMMs with utility, in JAX."""
