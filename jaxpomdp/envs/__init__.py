@@ -1,0 +1,1 @@
+"""Worlds: tables, generators, files, Gymnasium both ways, pictures."""
