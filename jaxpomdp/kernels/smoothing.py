@@ -1,0 +1,194 @@
+"""The backward pass and expected counts: what a whole tape says about each of its steps.
+
+Two routes to one ``Posterior``. ``smooth_scaled`` carries probabilities, renormalised at every step: fast, and
+accurate unless a probability that mattered fell below the smallest float. It can tell: then, at some step, the
+overlap of what the past and the future allow is itself tiny (``OVERLAP_FLOOR``). ``smooth_exact`` carries
+logarithms and takes a log-sum-exp over all pairs of states. ``smooth`` is the first, rescued by the second
+only when needed.
+
+Source: Rabiner (1989); thesis section 3.3. The overlap test is ours: everything lost to underflow is at most
+``N`` times the smallest float at a step, so it changes a step whose overlap is above the floor by less than
+the rounding of the dtype.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import lax
+
+from jaxpomdp._types import Array, Chain, Posterior
+from jaxpomdp.kernels.filtering import EXACT, Filtered, filter_tape, linked_steps, trial_starts
+from jaxpomdp.numerics import NEG, log_sum_exp
+
+
+def overlap_floor(dtype: jnp.dtype) -> float:
+    """Return the overlap below which scaled results are not trusted: 1e-30 in float32, 1e-280 in float64."""
+    return 1e-30 if jnp.finfo(dtype).bits <= 32 else 1e-280
+
+
+def relative_likelihood(log_obs: Array, valid: Array) -> Array:
+    """Return ``exp(log_obs - max log_obs)`` over the last axis: at most one; ones at padding and impossible steps."""
+    floored = jnp.maximum(log_obs, NEG)
+    weight = jnp.exp(floored - jnp.max(floored, axis=-1, keepdims=True))
+    return jnp.where(valid[..., None], weight, 1)
+
+
+def backward_weights(trans: Array, weight: Array, actions: Array, linked: Array) -> Array:
+    """Run backward: ``future_t(i) ∝ weight_t(i) sum_j trans(a_t, i, j) future_{t+1}(j)``, the sum's largest entry one.
+
+    Args:
+        trans: probabilities ``[A, N, N]``.
+        weight: relative likelihoods ``[T, N]``.
+        actions: int ``[T]``.
+        linked: bool ``[T]``, the step leads to the next; else the sum is one.
+
+    Returns:
+        ``future[T, N]``, in proportion to the probability of this and all later observations of the trial.
+    """
+
+    def step(following: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
+        here, action, goes_on = inputs
+        beta = jnp.matmul(trans[action], following, precision=EXACT)
+        peak = jnp.max(beta)
+        beta = jnp.where(goes_on, beta / jnp.where(peak > 0, peak, 1), 1)
+        return here * beta, here * beta
+
+    return lax.scan(step, jnp.ones_like(weight[0]), (weight, actions, linked), reverse=True)[1]
+
+
+def transition_counts(trans: Array, belief: Array, arriving: Array, actions: Array, linked: Array) -> Array:
+    """Return expected transitions ``xi(a) = trans(a) * sum_t [a_t = a] belief_t arriving_{t+1}^T``, ``[A, N, N]``.
+
+    One matrix product per action; nothing of size ``T N^2``.
+
+    Args:
+        trans: probabilities ``[A, N, N]``.
+        belief: filtered probabilities ``[T, N]``.
+        arriving: ``future`` over the step's overlap, ``[T, N]``.
+        actions: int ``[T]``.
+        linked: bool ``[T]``.
+    """
+    right = jnp.roll(arriving, -1, axis=0)
+
+    def count(action: Array) -> Array:
+        left = jnp.where((linked & (actions == action))[:, None], belief, 0)
+        return jnp.matmul(left.T, right, precision=EXACT)
+
+    return trans * lax.map(count, jnp.arange(trans.shape[0]))
+
+
+def smooth_scaled(
+    chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array
+) -> tuple[Posterior, Array]:
+    """Smooth one tape with renormalised probabilities; arguments as ``smooth``.
+
+    Returns:
+        The posterior, and a bool scalar: it can be trusted (no underflow that matters).
+    """
+    trans, linked = jnp.exp(chain.log_trans), linked_steps(start, valid)
+    filtered = filter_tape(chain, log_obs, actions, start, valid)
+    future = backward_weights(trans, relative_likelihood(log_obs, valid), actions, linked)
+    joint = filtered.predicted * future
+    overlap = jnp.sum(joint, axis=-1, keepdims=True)
+    trusted = overlap >= overlap_floor(overlap.dtype)
+    scale = jnp.where(trusted, 1 / jnp.where(trusted, overlap, 1), 0)
+    gamma = joint * scale
+    xi = transition_counts(trans, filtered.belief, future * scale, actions, linked)
+    initial = jnp.sum(jnp.where(trial_starts(start, valid)[:, None], gamma, 0), axis=0)
+    return Posterior(jnp.sum(filtered.log_norm), gamma, xi, initial), jnp.all(trusted[:, 0] | ~valid)
+
+
+def _log_product(log_row: Array, log_matrix: Array) -> Array:
+    """Return ``log(exp(log_row) @ exp(log_matrix))`` by a log-sum-exp per column."""
+    return log_sum_exp(log_row[:, None] + log_matrix, axis=0)
+
+
+def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Filtered:
+    """Filter one tape in logarithms: as ``filter_tape``, but belief and prediction come back as logarithms.
+
+    Slow (``N^2`` exponentials per step) and without underflow: a state of probability 1e-300 can come back.
+    """
+
+    def step(carried: Array, inputs: tuple[Array, ...]) -> tuple[Array, Filtered]:
+        row, action, first = inputs
+        predicted = jnp.where(first, chain.log_init, carried)
+        joint = jnp.maximum(predicted + row, NEG)
+        log_norm = log_sum_exp(joint)
+        possible = log_norm > NEG / 2
+        belief = jnp.where(possible, jnp.where(joint > NEG / 2, joint - log_norm, NEG), predicted)
+        following = _log_product(belief, chain.log_trans[action])
+        return following, Filtered(belief, predicted, jnp.where(possible, log_norm, NEG))
+
+    rows = jnp.where(valid[:, None], log_obs, 0)
+    _, (belief, predicted, log_norm) = lax.scan(
+        step, chain.log_init, (rows, actions, trial_starts(start, valid))
+    )
+    here = valid[:, None]
+    return Filtered(jnp.where(here, belief, NEG), jnp.where(here, predicted, NEG), jnp.where(valid, log_norm, 0))
+
+
+def _backward_exact(log_trans: Array, log_obs: Array, actions: Array, linked: Array) -> Array:
+    """Return ``log future[T, N]`` up to a constant per step; as ``backward_weights``, in logarithms."""
+
+    def step(following: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
+        row, action, goes_on = inputs
+        beta = _log_product(following, log_trans[action].T)
+        beta = jnp.where(goes_on, beta - jnp.max(beta), 0)
+        future = jnp.maximum(jnp.where(beta > NEG / 2, row + beta, NEG), NEG)
+        return future, future
+
+    return lax.scan(step, jnp.zeros_like(log_obs[0]), (log_obs, actions, linked), reverse=True)[1]
+
+
+def _exp_difference(x: Array, norm: Array) -> Array:
+    """Return ``exp(x - norm)``, and zero where ``x`` stands for the logarithm of zero."""
+    return jnp.where(x > NEG / 2, jnp.exp(x - norm), 0)
+
+
+def smooth_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
+    """Smooth one tape in logarithms: the textbook definition, slow and exact; arguments as ``smooth``."""
+    linked = linked_steps(start, valid)
+    filtered = filter_exact(chain, log_obs, actions, start, valid)
+    heeded = valid & (filtered.log_norm > NEG / 2)
+    rows = jnp.where(heeded[:, None], jnp.maximum(log_obs, NEG), 0)
+    future = _backward_exact(chain.log_trans, rows, actions, linked)
+    joint = jnp.maximum(filtered.predicted + future, NEG)
+    overlap = log_sum_exp(joint)
+    gamma = _exp_difference(joint, overlap[:, None])
+
+    def count(xi: Array, inputs: tuple[Array, ...]) -> tuple[Array, None]:
+        belief, arriving, norm, action, goes_on = inputs
+        pair = belief[:, None] + chain.log_trans[action] + arriving[None, :]
+        return xi.at[action].add(jnp.where(goes_on, _exp_difference(pair, norm), 0)), None
+
+    steps = (filtered.belief, jnp.roll(future, -1, axis=0), jnp.roll(overlap, -1), actions, linked)
+    xi, _ = lax.scan(count, jnp.zeros_like(chain.log_trans), steps)
+    initial = jnp.sum(jnp.where(trial_starts(start, valid)[:, None], gamma, 0), axis=0)
+    return Posterior(jnp.sum(filtered.log_norm), gamma, xi, initial)
+
+
+def smooth(chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
+    """Smooth one tape: ``gamma_t(i) = p(s_t = i | tape)`` and the expected transitions under each action.
+
+    An impossible step (zero likelihood in every state the past allows) is treated as a missing one and adds
+    ``NEG`` to the log-evidence; nothing is ever NaN. The exact route runs only when underflow mattered.
+
+    Args:
+        chain: ``log_init[N]``, ``log_trans[A, N, N]``; structural zeros are ``NEG``.
+        log_obs: ``[T, N]``, unnormalised is fine; a missing step is a row of zeros.
+        actions: int ``[T]``; the last of a trial is ignored.
+        start: bool ``[T]``, first step of a trial.
+        valid: bool ``[T]``, False at padding.
+
+    Returns:
+        ``Posterior`` with ``log_evidence[]``, ``gamma[T, N]``, ``xi[A, N, N]``, ``initial[N]``.
+    """
+    tape = (log_obs, actions, start, valid)
+    scaled, trusted = smooth_scaled(chain, *tape)
+    # A loop of zero or one turns: under vmap a `cond` would always run both branches, a loop need not.
+    _, posterior = lax.while_loop(
+        lambda carry: ~carry[0],
+        lambda carry: (jnp.ones_like(carry[0]), smooth_exact(chain, *tape)),
+        (trusted, scaled),
+    )
+    return posterior
