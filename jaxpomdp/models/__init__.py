@@ -1,0 +1,1 @@
+"""Models: parameter pytrees, the ``Family`` contract, and the ways to fit, compare and store them."""

@@ -1,0 +1,119 @@
+"""The two estimates every family is made of: a probability row from counts, a Gaussian from moments."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxpomdp._types import Array
+from jaxpomdp.numerics import NEG, safe_log
+
+LOG_TWO_PI = 1.8378770664093453
+
+
+class Moments(NamedTuple):
+    """Weight, mean and sum of squared deviations of weighted data.
+
+    ``weight`` broadcasts against ``mean[..., D]``; ``scatter`` is ``[..., D]``, or ``[..., D, D]``.
+    """
+
+    weight: Array
+    mean: Array
+    scatter: Array
+
+
+def dirichlet_mode(old: Array, counts: Array, pseudo: float | Array) -> Array:
+    """Return log rows ``log (counts + pseudo) / sum(counts + pseudo)`` along the last axis.
+
+    Entries that are ``NEG`` in ``old`` stay so; a row with neither counts nor pseudo-counts stays ``old``.
+    """
+    mass = jnp.where(old > NEG / 2, counts + pseudo, 0)
+    total = jnp.sum(mass, axis=-1, keepdims=True)
+    return jnp.where(total > 0, safe_log(mass / jnp.where(total > 0, total, 1)), old)
+
+
+def dirichlet_score(log_prob: Array, counts: float | Array) -> Array:
+    """Return each row's ``sum counts * log_prob`` over its possible entries: what counts are worth there."""
+    return jnp.sum(jnp.where(log_prob > NEG / 2, counts * log_prob, 0), axis=-1)
+
+
+def moments_from_sums(weight: Array, first: Array, second: Array, centre: Array) -> Moments:
+    """Turn weighted sums of ``x - centre`` and of its square (or outer product) into moments."""
+    mean = first / jnp.where(weight > 0, weight, 1)
+    if second.ndim > first.ndim:
+        spread = second - first[..., :, None] * mean[..., None, :]
+    else:
+        spread = jnp.maximum(second - first * mean, 0)
+    return Moments(weight, mean + centre, spread)
+
+
+def pooled_moments(x: Array, mask: Array) -> Moments:
+    """Return the moments ``[1, D]`` of all the rows ``x[..., D]`` where ``mask[...]``."""
+    rows = x.reshape(-1, x.shape[-1])
+    weight = mask.reshape(-1, 1).astype(x.dtype)
+    total = jnp.sum(weight, axis=0, keepdims=True)
+    mean = jnp.sum(weight * rows, axis=0, keepdims=True) / jnp.maximum(total, 1)
+    return Moments(total, mean, jnp.sum(weight * (rows - mean) ** 2, axis=0, keepdims=True))
+
+
+def pooled_variance(pooled: Moments) -> Array:
+    """Return the variance of all the data; constant data get a width of a thousandth of their scale."""
+    variance = pooled.scatter / jnp.maximum(pooled.weight, 1)
+    return jnp.maximum(variance, 1e-6 * pooled.mean**2 + 1e-12)
+
+
+def variance_mode(old: Array, moments: Moments, pooled: Array, floor: float, strength: float) -> Array:
+    """Return the variances that maximise the data's and the inverse gamma prior's density above a floor.
+
+    ``(scatter + strength * pooled) / (weight + strength)``, at least ``floor * pooled``; ``old`` where there
+    is neither weight nor prior.
+    """
+    weight = moments.weight + strength
+    mode = (moments.scatter + strength * pooled) / jnp.where(weight > 0, weight, 1)
+    return jnp.maximum(jnp.where(weight > 0, mode, old), floor * pooled)
+
+
+def gaussian_score(mean: Array, variance: Array, moments: Moments) -> Array:
+    """Return each row's ``sum weight * E[log N(x; mean, variance)]`` of the data behind the moments."""
+    spread = moments.scatter + moments.weight * (moments.mean - mean) ** 2
+    return -0.5 * jnp.sum(moments.weight * (LOG_TWO_PI + jnp.log(variance)) + spread / variance, axis=-1)
+
+
+def inverse_gamma_score(variance: Array, pooled: Array, strength: float) -> Array:
+    """Return each row's log prior, up to a constant: ``-strength/2 * (log v + pooled / v)`` summed."""
+    return -0.5 * strength * jnp.sum(jnp.log(variance) + pooled / variance, axis=-1)
+
+
+def _merge(a: Moments, b: Moments) -> Moments:
+    weight = a.weight + b.weight
+    share = b.weight / jnp.where(weight > 0, weight, 1)
+    delta = b.mean - a.mean
+    outer = a.scatter.ndim > a.mean.ndim
+    square = delta[..., :, None] * delta[..., None, :] if outer else delta**2
+    between = a.weight * share
+    between = between[..., None] if outer else between
+    return Moments(weight, a.mean + share * delta, a.scatter + b.scatter + between * square)
+
+
+def _is_moments(x: object) -> bool:
+    return isinstance(x, Moments)
+
+
+def add_statistics(a: Any, b: Any) -> Any:
+    """Return the statistics of two batches taken together; counts add, moments merge without cancellation."""
+
+    def add(x: Any, y: Any) -> Any:
+        return _merge(x, y) if _is_moments(x) else x + y
+
+    return jax.tree.map(add, a, b, is_leaf=_is_moments)
+
+
+def scale_statistics(statistics: Any, factor: float | Array) -> Any:
+    """Return statistics of which every step counts ``factor`` times (a decay, or the strength of a prior)."""
+
+    def scale(x: Any) -> Any:
+        return Moments(x.weight * factor, x.mean, x.scatter * factor) if _is_moments(x) else x * factor
+
+    return jax.tree.map(scale, statistics, is_leaf=_is_moments)
