@@ -76,8 +76,8 @@ def assemble(
         **static: the static fields of :class:`~jaxpomdp.envs.world.World`.
 
     Raises:
-        ValueError: a shape does not fit, a row does not sum to one, or the first observation is left out though
-            the observation depends on the action.
+        ValueError: a shape does not fit, a row does not sum to one, or the first observation is left out
+            though the observation depends on the action.
     """
     if first_observation is None and observation.shape[0] > 1:
         raise ValueError("first_observation must be given where the observation depends on the action")
@@ -105,29 +105,46 @@ def _pair(prob: np.ndarray) -> tuple[Any, Any]:
     return jnp.asarray(prob, jnp.float32), jnp.asarray(running_sum(prob))
 
 
-def _check(tables: Tables, observation, first, start, terminal, static: Mapping[str, Any]) -> None:
+def _check(
+    tables: Tables,
+    observation: np.ndarray,
+    first: np.ndarray,
+    start: np.ndarray,
+    terminal: np.ndarray,
+    static: Mapping[str, Any],
+) -> None:
     num_actions, num_states, _ = tables.prob.shape
     num_observations = observation.shape[-1]
-    expected = {
-        "observation": (observation, {(1, num_states, num_observations), (num_actions, num_states, num_observations)}),
-        "first_observation": (first, {(num_states, num_observations)}),
-        "start": (start, {(num_states,)}),
-        "terminal": (terminal, {(num_states,)}),
-    }
-    for name, (array, shapes) in expected.items():
-        if array.shape not in shapes:
-            raise ValueError(f"{name} must have shape {' or '.join(map(str, sorted(shapes)))}, got {array.shape}")
-    rows = {"transitions": tables.prob, "observation": observation, "first_observation": first, "start": start}
-    for name, prob in rows.items():
-        _check_rows(name, prob)
-    for name, size in (("action_names", num_actions), ("observation_names", num_observations)):
-        if len(static.get(name, ())) != size:
-            raise ValueError(f"{name} must hold {size} names, got {len(static.get(name, ()))}")
+    _check_shape("observation", observation[0], (num_states, num_observations))
+    _check_shape("first_observation", first, (num_states, num_observations))
+    _check_shape("start", start, (num_states,))
+    _check_shape("terminal", terminal, (num_states,))
+    if observation.shape[0] not in (1, num_actions):
+        raise ValueError(f"observation must have 1 or {num_actions} tables, got {observation.shape[0]}")
+    _check_rows("transitions", tables.prob)
+    _check_rows("observation", observation)
+    _check_rows("first_observation", first)
+    _check_rows("start", start)
+    _check_names("action_names", static, num_actions)
+    _check_names("observation_names", static, num_observations)
+
+
+def _check_shape(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape} (of states, observations), got {array.shape}")
 
 
 def _check_rows(name: str, prob: np.ndarray) -> None:
-    wrong = (np.abs(prob.sum(axis=-1) - 1) > ROW_TOLERANCE) | (prob < 0).any(axis=-1)
+    wrong = ~(np.abs(prob.sum(axis=-1) - 1) <= ROW_TOLERANCE) | (prob < 0).any(axis=-1)
     if np.any(wrong):
         where = tuple(int(i) for i in np.argwhere(wrong)[0])
         row = prob[where]
-        raise ValueError(f"{name}{list(where)} must be probabilities that sum to one, got sum {row.sum()}, {row}")
+        raise ValueError(
+            f"{name}{list(where)} must be probabilities that sum to 1, got {row} of sum {row.sum()}"
+        )
+
+
+def _check_names(name: str, static: Mapping[str, Any], size: int) -> None:
+    given = static.get(name, ())
+    if len(given) != size:
+        raise ValueError(f"{name} must hold {size} names, got {len(given)}: {given}")

@@ -1,4 +1,4 @@
-"""Maps in ASCII: ``*`` or ``.`` free, ``+`` or ``G`` goal, ``S`` free and a start, ``-`` costly, blank or ``#`` wall.
+"""Maps in ASCII: ``*`` or ``.`` free, ``+`` or ``G`` goal, ``S`` a start, ``-`` costly, blank or ``#`` wall.
 
 Cells are numbered row by row; directions are 0 north, 1 east, 2 south, 3 west.
 """
@@ -6,6 +6,7 @@ Cells are numbered row by row; directions are 0 north, 1 east, 2 south, 3 west.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 NORTH, EAST, SOUTH, WEST = range(4)
 MOVES = ((-1, 0), (0, 1), (1, 0), (0, -1))
@@ -29,8 +30,11 @@ class Grid:
     def neighbour(self, cell: int, direction: int) -> int | None:
         """Return the cell that lies next in a direction, or None where a wall is."""
         row, column = self.cells[cell]
-        there = (row + MOVES[direction][0], column + MOVES[direction][1])
-        return self.cells.index(there) if there in self.cells else None
+        return self._number.get((row + MOVES[direction][0], column + MOVES[direction][1]))
+
+    @cached_property
+    def _number(self) -> dict[tuple[int, int], int]:
+        return {place: cell for cell, place in enumerate(self.cells)}
 
     def wall(self, cell: int, direction: int) -> bool:
         """Say whether a wall lies next to a cell in a direction."""

@@ -1,4 +1,4 @@
-"""McCallum's hallway navigation (1995), thesis section 3.5.1 and Figure 3.3: absolute moves, four wall sensors."""
+"""McCallum's hallway navigation (1995), thesis section 3.5.1: absolute moves, four wall sensors."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ S*****S
 *  *  *
 S*****S
 """
-"""A RECONSTRUCTION: the map of 1995 is in no public text that was found. It keeps what is known of it: starts in
-four corners, the goal in the centre, many cells that look alike; the best path is 5 steps from each corner, and an
-average of exactly 7 means that two corners take the long way."""
+"""A RECONSTRUCTION of Figure 3.3: the map of 1995 is in no public text that was found. It keeps what is
+known: starts in four corners, the goal in the centre, many cells that look alike. The best path is 5 steps from each
+corner; an average of exactly 7 means that two corners take the long way."""
 
 
 def hallway_navigation(step_limit: int = 251) -> World:
@@ -48,14 +48,17 @@ def hallway(
 ) -> World:
     """Return a hallway from any map in the characters of :mod:`jaxpomdp.envs.grid`; a state is a cell.
 
-    The observation is ``8 north + 4 east + 2 south + 1 west`` (a wall lies there), and 16 at the goal, where the
-    trial is over. Trials start in a cell marked ``S``, or, without any, in any cell that is not a goal.
+    The observation is ``8 north + 4 east + 2 south + 1 west`` (a wall lies there), and 16 at the goal, where
+    the trial is over. Trials start in a cell marked ``S``, or, without any, in any cell that is not a goal.
 
     Args:
         ascii_map: rows of characters.
         name: of the world.
-        goal, bump, move: reward of entering the goal, of running into a wall, of any other move.
-        discount, step_limit: of the world.
+        goal: reward of entering the goal.
+        bump: reward of running into a wall.
+        move: reward of any other move.
+        discount: gamma.
+        step_limit: actions in a trial at most.
 
     Raises:
         ValueError: the map has an unknown character, no goal, or nowhere to start.

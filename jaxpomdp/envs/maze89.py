@@ -1,8 +1,8 @@
-"""The mazes of Littman, Cassandra and Kaelbling (1995): hallway2 (89 states), hallway (57 states) and tiger-grid.
+"""The mazes of Littman, Cassandra and Kaelbling (1995): hallway2 (89 states), hallway (57), tiger-grid.
 
-The agent has a position and a heading; ``state = 4 * cell + heading``, headings north, east, south, west. The goal
-keeps its four headings, as in the public files: "89 states" are 22 cells with a heading and one goal, 92 numbers.
-All noise is generated here by rule; the tests compare every entry with the files.
+The agent has a position and a heading; ``state = 4 * cell + heading``, headings north, east, south, west. The
+goal keeps its four headings, as in the public files: "89 states" are 22 cells with a heading and one goal, 92
+numbers. All noise is generated here by rule; the tests compare every entry with the files.
 """
 
 from __future__ import annotations
@@ -16,11 +16,16 @@ from jaxpomdp.envs.world import Layout, World
 
 ACTIONS = ("no-op", "forward", "turn right", "turn about", "turn left")
 SENSES = ("ahead", "right", "behind", "left")
-TURNS = ({0: 1.0}, None, {0: 0.1, 1: 0.7, 2: 0.1, 3: 0.1}, {0: 0.1, 1: 0.15, 2: 0.6, 3: 0.15}, {0: 0.1, 1: 0.1, 2: 0.1, 3: 0.7})
-"""For each action that turns, the probability of each change of heading (quarter turns to the right)."""
+TURNS = {
+    0: (1.0, 0.0, 0.0, 0.0),
+    2: (0.1, 0.7, 0.1, 0.1),
+    3: (0.1, 0.15, 0.6, 0.15),
+    4: (0.1, 0.1, 0.1, 0.7),
+}
+"""For each action but forward, the probability of turning by 0, 1, 2, 3 quarters to the right."""
 
 FORWARD = ((0.8, 0, 0), (0.05, 1, 1), (0.05, 3, 3), (0.025, 2, 0), (0.025, 2, 2))
-"""Going forward: probability, direction moved and change of heading, both relative to the heading; else nothing."""
+"""Going forward: probability, direction moved, change of heading (relative to the heading); else nothing."""
 
 SEES_WALL, SEES_WALL_WRONGLY = 0.9, 0.05
 """``P(bit = 1 | wall)`` and ``P(bit = 1 | open)``, independent for the four directions."""
@@ -43,9 +48,9 @@ TIGER_GRID_MAP = """
 
 
 def maze89(step_limit: int = 251) -> World:
-    """Return the 89-state maze (hallway2): 17 observations, +1 on entering the goal, any other state a start.
+    """Return the 89-state maze (hallway2), thesis section 3.5.3: +1 on entering the goal, any other start.
 
-    Thesis section 3.5.3. Observation = ``8 ahead + 4 right + 2 behind + 1 left`` (a wall seen there); the goal is 16.
+    The observation is ``8 ahead + 4 right + 2 behind + 1 left`` (a wall seems to be there); the goal is 16.
 
     Example:
         >>> world = maze89()
@@ -56,9 +61,9 @@ def maze89(step_limit: int = 251) -> World:
 
 
 def maze57(step_limit: int = 251) -> World:
-    """Return the 57-state maze (hallway): as :func:`maze89` with four landmarks, seen surely, and the goal as 20.
+    """Return the 57-state maze (hallway): as :func:`maze89` with four landmarks, and the goal as 20.
 
-    A landmark shows when the agent faces south in the top row above one of the four rooms: observations 16 to 19.
+    A landmark, 16 to 19, shows surely when the agent faces south in the top row above one of the four rooms.
 
     Example:
         >>> maze57().num_states, maze57().num_observations
@@ -94,7 +99,8 @@ def heading_maze(
         name: of the world.
         starts: states drawn uniformly at a reset; by default every state that is not a goal.
         landmarks: states that show an observation of their own surely, numbered from 16 on.
-        discount, step_limit: of the world.
+        discount: gamma.
+        step_limit: actions in a trial at most.
 
     Raises:
         ValueError: the map is bad, or a start is a goal.
@@ -105,13 +111,11 @@ def heading_maze(
     starts = [s for s in range(terminal.size) if not terminal[s]] if starts is None else starts
     if any(terminal[s] for s in starts):
         raise ValueError(f"starts must not be goals, got {[s for s in starts if terminal[s]]}")
-    start = np.zeros(terminal.size)
-    start[starts] = 1 / len(starts)
     marks = tuple(f"landmark {i + 1}" for i in range(len(landmarks)))
     return assemble(
-        tabulate([[outcomes(grid, state, action) for state in range(terminal.size)] for action in range(len(ACTIONS))]),
+        tabulate([[outcomes(grid, s, action) for s in range(terminal.size)] for action in range(5)]),
         observation_table(grid, landmarks)[None],
-        start,
+        np.isin(np.arange(terminal.size), starts) / len(starts),
         terminal,
         name=name,
         discount=discount,
@@ -120,31 +124,34 @@ def heading_maze(
         action_names=ACTIONS,
         observation_names=(*grids.wall_names(SENSES), *marks, "goal"),
         senses=SENSES,
-        layout=Layout(grid.rows, tuple(c for c in grid.cells for _ in range(4)), (0, 1, 2, 3) * len(grid.cells)),
+        layout=_layout(grid),
     )
 
 
+def _layout(grid: Grid) -> Layout:
+    return Layout(grid.rows, tuple(c for c in grid.cells for _ in range(4)), (0, 1, 2, 3) * len(grid.cells))
+
+
 def outcomes(grid: Grid, state: int, action: int) -> Outcomes:
-    """Return what an action brings in a state: goal entered +1, costly cell arrived in -1; a goal keeps the agent."""
+    """Return what an action brings: +1 on entering the goal, -1 in a costly cell; a goal is for ever."""
     cell, heading = divmod(state, 4)
     if cell in grid.goals:
         return {(state, 0.0): 1.0}
-    turn = TURNS[action]
-    moved = _forward(grid, cell, heading) if turn is None else {
-        4 * cell + (heading + change) % 4: prob for change, prob in turn.items()
-    }
-    return {(arrived, _reward(grid, arrived // 4)): prob for arrived, prob in moved.items()}
+    moved = _turned(cell, heading, action) if action in TURNS else _forward(grid, cell, heading)
+    return merge([(prob, {(state, _reward(grid, state // 4)): 1.0}) for prob, state in moved])
 
 
-def _forward(grid: Grid, cell: int, heading: int) -> dict[int, float]:
-    parts = []
+def _turned(cell: int, heading: int, action: int) -> list[tuple[float, int]]:
+    return [(prob, 4 * cell + (heading + change) % 4) for change, prob in enumerate(TURNS[action])]
+
+
+def _forward(grid: Grid, cell: int, heading: int) -> list[tuple[float, int]]:
+    here = 4 * cell + heading
+    moved = [(1 - sum(prob for prob, _, _ in FORWARD), here)]
     for prob, direction, change in FORWARD:
         there = grid.neighbour(cell, (heading + direction) % 4)
-        arrived = 4 * cell + heading if there is None else 4 * there + (heading + change) % 4
-        parts.append((prob, {(arrived, 0.0): 1.0}))
-    nothing = 1 - sum(prob for prob, _, _ in FORWARD)
-    merged = merge([*parts, (nothing, {(4 * cell + heading, 0.0): 1.0})])
-    return {arrived: prob for (arrived, _), prob in merged.items()}
+        moved.append((prob, here if there is None else 4 * there + (heading + change) % 4))
+    return moved
 
 
 def _reward(grid: Grid, cell: int) -> float:
@@ -152,7 +159,7 @@ def _reward(grid: Grid, cell: int) -> float:
 
 
 def observation_table(grid: Grid, landmarks: list[int]) -> np.ndarray:
-    """Return ``P(o | s)``, float64 ``[N, 16 + landmarks + 1]``: noisy wall bits, sure landmarks, sure goal."""
+    """Return ``P(o | s)``, float64 ``[N, 16 + landmarks + 1]``: noisy walls, sure landmarks, sure goal."""
     num_states = 4 * len(grid.cells)
     table = np.zeros((num_states, 17 + len(landmarks)))
     for state in range(num_states):

@@ -31,8 +31,8 @@ def make(name: str, **settings: Any) -> World:
     """Make a world by its name.
 
     Args:
-        name: ``maze89``, ``maze57``, ``tiger-grid``, ``hallway``, ``tmaze-N`` with a corridor of ``N`` moves; any of
-            them followed by ``-noise`` for the noise of thesis section 3.5.1.
+        name: ``maze89``, ``maze57``, ``tiger-grid``, ``hallway``, ``tmaze-N`` with a corridor of ``N`` moves;
+            any of them followed by ``-noise`` for the noise of thesis section 3.5.1.
         **settings: of the world's own function, such as ``step_limit``.
 
     Raises:

@@ -1,8 +1,9 @@
 """Worlds as tables: what an agent acts in, drawn by explicit uniform numbers on the device.
 
-A world is a pytree of arrays, so one compiled program serves every world of its shapes; ``step`` and ``reset`` are
-for ONE agent and are lifted by ``jax.vmap`` over seeds while the world is shared. A draw is an inverse cumulative
-distribution at a number in [0, 1) that the caller supplies, so it never depends on the position in a batch.
+A world is a pytree of arrays, so one compiled program serves every world of its shapes; ``step`` and
+``reset`` are for ONE agent and are lifted by ``jax.vmap`` over seeds while the world is shared. A draw is an
+inverse cumulative distribution at a number in [0, 1) that the caller supplies, so it never depends on the
+position in a batch.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ UNIFORMS_PER_RESET = 2
 """How many numbers ``reset`` consumes: for the state, for the observation."""
 
 UNIFORMS_PER_STEP = 3
-"""How many numbers ``step`` consumes: for the transition, for the observation, for the noise on the reward."""
+"""How many numbers ``step`` consumes: for the transition, the observation, the noise on the reward."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,15 +47,16 @@ def _static(default: object) -> object:
 class World:
     """The tables of a partially observable world with ``N`` states, ``A`` actions and ``O`` observations.
 
-    ``K`` is the largest number of outcomes of one action in one state; shorter rows are padded with probability
-    zero. Every ``*_cdf`` is the running sum of the table before it along the last axis and ends in exactly 1.
+    ``K`` is the largest number of outcomes of one action in one state; shorter rows are padded with
+    probability zero. Every ``*_cdf`` is the running sum of the table before it along the last axis and ends
+    in exactly 1.
 
     Attributes:
         successors: int32 ``[A, N, K]``, the state that each outcome leads to.
         transition_prob, transition_cdf: float32 ``[A, N, K]``, ``P(outcome k | s, a)``.
         reward: float32 ``[A, N, K]``, paid for outcome ``k`` of action ``a`` in ``s``.
-        observation_prob, observation_cdf: float32 ``[1 or A, N, O]``, ``P(o | a, arrived s)``; the first axis is 1
-            where the observation does not depend on the action.
+        observation_prob, observation_cdf: float32 ``[1 or A, N, O]``, ``P(o | a, arrived s)``; the first axis
+            is 1 where the observation does not depend on the action.
         first_observation_prob, first_observation_cdf: float32 ``[N, O]``, seen at a reset.
         start_prob, start_cdf: float32 ``[N]``.
         terminal: bool ``[N]``; a terminal state keeps the agent for ever and pays nothing.
@@ -105,7 +107,7 @@ class World:
 
 
 class Step(NamedTuple):
-    """What one action brought: the new ``state`` and ``observation``, the ``reward`` paid, and ``terminated``."""
+    """What one action brought: new ``state`` and ``observation``, ``reward`` paid, and ``terminated``."""
 
     state: Array
     observation: Array
@@ -129,7 +131,7 @@ class TrueModel(NamedTuple):
 
 
 def _draw(cdf: Array, uniform: Array) -> Array:
-    """Return the least index whose ``cdf[..., K]`` exceeds ``uniform`` in [0, 1); a zero probability is never drawn."""
+    """Return the least index whose ``cdf[K]`` exceeds ``uniform``; a zero probability is never drawn."""
     return jnp.sum(uniform >= cdf, axis=-1, dtype=jnp.int32)
 
 
@@ -152,7 +154,8 @@ def step(world: World, state: Array, action: Array, uniforms: Array) -> Step:
 
     Args:
         world: the tables.
-        state, action: int scalars.
+        state: int scalar.
+        action: int scalar.
         uniforms: float ``[3]`` in [0, 1), for the outcome, the observation and the noise on the reward.
 
     Returns:
@@ -178,7 +181,7 @@ def step_key(world: World, state: Array, action: Array, key: Array) -> Step:
 
 
 def model_of(world: World) -> TrueModel:
-    """Return the world as dense tables, ``trans[a, s, s'] = sum of the outcomes' probabilities that lead to s'``."""
+    """Return the world as dense tables; ``trans[a, s, s']`` sums the outcomes that lead to ``s'``."""
     num_actions, num_states = world.num_actions, world.num_states
     a = jnp.arange(num_actions)[:, None, None]
     s = jnp.arange(num_states)[None, :, None]
@@ -195,5 +198,6 @@ def running_sum(prob: np.ndarray) -> np.ndarray:
     prob = np.asarray(prob, np.float64)
     total = np.cumsum(prob, axis=-1)
     positive_from_here = np.flip(np.cumsum(np.flip(prob, -1), axis=-1), -1)
-    none_after = np.concatenate([positive_from_here[..., 1:] <= 0, np.ones_like(prob[..., :1], bool)], axis=-1)
+    last = np.ones_like(prob[..., :1], bool)
+    none_after = np.concatenate([positive_from_here[..., 1:] <= 0, last], axis=-1)
     return np.where(none_after, 1.0, total / total[..., -1:]).astype(np.float32)
