@@ -1,0 +1,57 @@
+# Every target sets itself up in .venv first, and again only when pyproject.toml or constraints.txt changed.
+VENV ?= .venv
+BIN := $(VENV)/bin
+WORKERS ?= 2
+# What `make reproduce` makes: one name, several, or all.
+NAME ?= all
+TESTFLAGS ?=
+SETUP := pyproject.toml constraints.txt tools/make_venv.sh
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-slow lint format reproduce bench build constraints clean
+
+help:  ## show the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(VENV)/.ready-demo: $(SETUP)
+	@tools/make_venv.sh $(VENV) cli,plots
+	@touch $@
+
+$(VENV)/.ready-dev: $(SETUP)
+	@tools/make_venv.sh $(VENV) dev
+	@touch $@ $(VENV)/.ready-demo
+
+demo: $(VENV)/.ready-demo  ## watch five agents learn the 89-state maze, then see them beside the thesis (3 minutes)
+	@$(BIN)/jaxpomdp demo
+
+test: $(VENV)/.ready-dev  ## the usual tests
+	$(BIN)/python -m pytest -n $(WORKERS) $(TESTFLAGS)
+
+test-slow: $(VENV)/.ready-dev  ## all tests, the long ones too
+	$(BIN)/python -m pytest -n $(WORKERS) -m "slow or not slow" $(TESTFLAGS)
+
+lint: $(VENV)/.ready-dev  ## style, format, layering and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+format: $(VENV)/.ready-dev  ## rewrite the code in the usual format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+reproduce: $(VENV)/.ready-demo  ## the thesis's tables and figures: make reproduce NAME=table-3.1
+	$(BIN)/jaxpomdp reproduce $(NAME)
+
+bench: $(VENV)/.ready-dev  ## speed, beside other libraries
+	for script in benchmarks/speed/*.py; do $(BIN)/python "$$script" || exit 1; done
+
+build: $(VENV)/.ready-dev  ## the wheel and the source archive, in dist/
+	$(BIN)/python -m build
+
+constraints: $(VENV)/.ready-dev  ## pin the newest versions that fit together
+	$(BIN)/python tools/pin.py > constraints.new
+	mv constraints.new constraints.txt
+
+clean:  ## remove what the targets made
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
