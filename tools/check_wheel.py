@@ -1,4 +1,4 @@
-"""Check an installed jaxpomdp from outside its repository: every public name, its data, its command's manners."""
+"""Check an installed jaxpomdp from outside its repository: public names, data, the command's manners."""
 
 from __future__ import annotations
 
