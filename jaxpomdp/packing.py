@@ -1,8 +1,8 @@
 """The one bridge between ragged specs on the host and padded arrays on the device.
 
-A padded array is the ragged one read through an index ``slots[S, capacity]``: the state in each slot, and state 0
-in spare slots (so that every parameter stays valid there). ``alive`` tells them apart, and spare slots have no
-probability. Carrying a value through an edit is the same read with the edit's ``origin`` as the index.
+A padded array is the ragged one read through an index ``slots[S, capacity]``: the state in each slot, and
+state 0 in spare slots (so that every parameter stays valid there). ``alive`` tells them apart, and spare
+slots have no probability. Carrying a value through an edit is the same read with the edit's ``origin``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ import numpy as np
 from jaxpomdp._types import Array
 from jaxpomdp.models.emission import Categorical, DiagonalGaussian, ReturnModel
 from jaxpomdp.models.flat import FlatParams
+from jaxpomdp.models.full_gaussian import FullGaussian
 from jaxpomdp.numerics import NEG
 from jaxpomdp.structure.spec import Channel, FlatSpec
 
-CHANNELS = {kind.__name__: kind for kind in (Categorical, DiagonalGaussian)}
+CHANNELS = {kind.__name__: kind for kind in (Categorical, DiagonalGaussian, FullGaussian)}
 """Emission classes by the name that a spec's ``Channel.kind`` gives them."""
 
 Tree = TypeVar("Tree")
@@ -34,7 +35,7 @@ def pack(specs: Sequence[FlatSpec], capacity: int) -> FlatParams:
     The numbers keep their type where the device has it, so ``unpack(pack(specs, capacity), s) == specs[s]``.
 
     Raises:
-        ValueError: no specs, more states than slots, or specs that differ in actions, channels or return columns.
+        ValueError: no specs, more states than slots, or specs with other actions, channels or returns.
     """
     _check_alike(specs)
     slots, alive = slots_of([np.arange(spec.num_states) for spec in specs], capacity)
@@ -43,14 +44,15 @@ def pack(specs: Sequence[FlatSpec], capacity: int) -> FlatParams:
         return np.stack([part[index] for part, index in zip(parts, slots, strict=True)])
 
     emissions = tuple(
-        CHANNELS[channel.kind](**{
-            name: padded([spec.emissions[c].values[name] for spec in specs]) for name in channel.values
-        })
+        CHANNELS[channel.kind](
+            **{name: padded([spec.emissions[c].values[name] for spec in specs]) for name in channel.values}
+        )
         for c, channel in enumerate(specs[0].emissions)
     )
     log_init = np.where(alive, padded([spec.log_init for spec in specs]), _like(specs, NEG))
-    returns = ReturnModel(*(padded([getattr(s, name) for s in specs]) for name in ("return_mean", "return_var")))
-    return jax.device_put(FlatParams(log_init, _padded_transitions(specs, capacity), emissions, returns, alive))
+    mean, var = (padded([getattr(spec, name) for spec in specs]) for name in ("return_mean", "return_var"))
+    log_trans = _padded_transitions(specs, capacity)
+    return jax.device_put(FlatParams(log_init, log_trans, emissions, ReturnModel(mean, var), alive))
 
 
 def unpack(params: FlatParams, s: int) -> FlatSpec:
@@ -77,7 +79,7 @@ def unpack_all(params: FlatParams) -> list[FlatSpec]:
 
 
 def carry(values: Tree, origins: Sequence[np.ndarray], capacity: int, axis: int = 1) -> Tree:
-    """Carry per-state values through edits: slot n of model s becomes old slot ``origins[s][n]``; spare slots 0.
+    """Carry per-state values through edits: slot n of model s takes old slot ``origins[s][n]``; spare ones 0.
 
     Args:
         values: arrays ``[S, old capacity, ...]`` (a pytree of them), such as Q-values ``[S, cap, A]``.
@@ -163,7 +165,8 @@ def _check_alike(specs: Sequence[FlatSpec]) -> None:
         raise ValueError("specs must hold at least one model, got none")
     for s, spec in enumerate(specs):
         if _form(spec) != _form(specs[0]):
-            raise ValueError(f"specs must be alike; specs[0] has {_form(specs[0])}, specs[{s}] has {_form(spec)}")
+            forms = f"specs[0] has {_form(specs[0])}, specs[{s}] has {_form(spec)}"
+            raise ValueError(f"specs must be alike; {forms}")
     unknown = [c.kind for c in specs[0].emissions if c.kind not in CHANNELS]
     if unknown:
         raise ValueError(f"channels must be of kinds {', '.join(CHANNELS)}, got {', '.join(unknown)}")
@@ -171,12 +174,6 @@ def _check_alike(specs: Sequence[FlatSpec]) -> None:
 
 def _form(spec: FlatSpec) -> str:
     """Describe what the specs of one pack have in common."""
-    parts = [
-        f"{c.kind}({', '.join(f'{name}[N{_tail(v)}]' for name, v in c.values.items())})" for c in spec.emissions
-    ]
+    channels = [c.kind + str({name: v.shape[1:] for name, v in c.values.items()}) for c in spec.emissions]
     columns = spec.return_mean.shape[1]
-    return f"{spec.num_actions} actions, {columns} return columns, channels {', '.join(parts) or 'none'}"
-
-
-def _tail(array: np.ndarray) -> str:
-    return "".join(f", {size}" for size in array.shape[1:])
+    return f"{spec.num_actions} actions, {columns} return columns, channels {', '.join(channels) or 'none'}"

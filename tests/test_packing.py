@@ -17,7 +17,9 @@ from jaxpomdp.structure.edits import Shares, clone_state
 from jaxpomdp.structure.spec import Channel, FlatSpec
 
 
-def random_spec(seed: int, n: int, a: int = 2, per_action: bool = False, dtype: type = np.float32) -> FlatSpec:
+def random_spec(
+    seed: int, n: int, a: int = 2, per_action: bool = False, dtype: type = np.float32
+) -> FlatSpec:
     rng = np.random.default_rng(seed)
     channels = [
         rng.dirichlet(np.ones(3), n).astype(dtype),
@@ -60,7 +62,8 @@ def test_spare_slots_have_no_probability_and_valid_parameters() -> None:
     dead = ~params.alive
     assert (np.exp(params.log_init)[dead] == 0).all()
     probability = np.exp(params.log_trans)
-    np.testing.assert_allclose(probability.sum(-1), np.broadcast_to(params.alive[:, None], (2, 2, 6)), atol=1e-6)
+    wanted = np.broadcast_to(params.alive[:, None], (2, 2, 6))
+    np.testing.assert_allclose(probability.sum(-1), wanted, atol=1e-6)
     assert (params.returns.var > 0).all()
     np.testing.assert_allclose(np.exp(params.emissions[0].log_prob).sum(-1), 1, rtol=1e-6)
 
@@ -100,13 +103,13 @@ def test_errors_name_what_is_wrong() -> None:
     spec = random_spec(0, 3)
     with pytest.raises(ValueError, match="at least one"):
         pack([], 3)
-    with pytest.raises(ValueError, match="capacity must hold .* 3 states, got 2"):
+    with pytest.raises(ValueError, match=r"capacity must hold .* 3 states, got 2"):
         pack([spec], 2)
     with pytest.raises(ValueError, match=r"alike; .* 2 actions.* specs\[1\] has 3 actions"):
         pack([spec, random_spec(0, 3, a=3)], 3)
-    with pytest.raises(ValueError, match="kinds Categorical.*got Poisson"):
-        odd = Channel("Poisson", {"rate": np.ones((1, 2))})
-        pack([FlatSpec.from_probabilities([1.0], [[[1.0]]], [odd])], 1)
+    odd = FlatSpec.from_probabilities([1.0], [[[1.0]]], [Channel("Poisson", {"rate": np.ones((1, 2))})])
+    with pytest.raises(ValueError, match=r"kinds Categorical.*got Poisson"):
+        pack([odd], 1)
     with pytest.raises(ValueError, match=r"s must be 0 \.\. 0, got 1"):
         unpack(pack([spec], 3), 1)
     with pytest.raises(ValueError, match="must have 2 models"):

@@ -1,1 +1,1 @@
-"""Structure on the host, in NumPy: models as ragged values, evidence about them, tests, and the edits they call for."""
+"""Structure on the host, in NumPy: models as ragged values, evidence about them, tests, and edits."""

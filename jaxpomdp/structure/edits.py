@@ -87,13 +87,17 @@ class Allowance(NamedTuple):
         return ~np.asarray(self.resting, bool)
 
 
+UNLIMITED = Allowance()
+"""No limits, no random numbers."""
+
+
 class Operator(NamedTuple):
     """A kind of edit as three functions.
 
     Attributes:
         kind: its name.
         propose: ``(spec, evidence, config, allowance) -> list[Edit]``, best first.
-        shrink: ``(edit, room) -> Edit | None``, the edit with at most ``room`` new states, if there is one.
+        shrink: ``(edit, room) -> Edit | None``, the edit with at most ``room >= 1`` new states, if any.
         apply: ``(spec, edit) -> spec``, a pure function.
     """
 

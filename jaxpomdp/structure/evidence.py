@@ -17,14 +17,14 @@ class ReturnEvidence:
     """Belief-weighted return distributions, per state (K = 1) or per state and action (K = A).
 
     Attributes:
-        edges: ``[bins + 1]``, non-decreasing; bin b holds ``edges[b] <= R < edges[b + 1]``; the two outer bins
-            also hold what lies beyond.
-        centres: ``[bins]``, a value that stands for each bin: the mean of the returns in it, or its midpoint.
+        edges: ``[bins + 1]``, non-decreasing; bin b holds ``edges[b] <= R < edges[b + 1]``; the two outer
+            bins also hold what lies beyond.
+        centres: ``[bins]``, a value that stands for each bin: the mean of the returns in it, or its middle.
         hist: ``[N, K, bins]``, sum of the weights ``gamma[t, n]`` of the returns in the bin.
-        mean: ``[N, K]``, weighted mean of the returns themselves (not of the bins); any number where no weight is.
+        mean: ``[N, K]``, weighted mean of the returns themselves (not of bins); anything where no weight is.
         var: ``[N, K]``, weighted variance.
-        effective: ``[N, K]``, independent returns the weight is worth. Returns of one trial are nearly copies of
-            each other, so this is ``(sum_b W_b)^2 / sum_b W_b^2`` over trials b with total weight ``W_b``
+        effective: ``[N, K]``, independent returns the weight is worth. Returns of one trial are nearly copies
+            of each other, so this is ``(sum_b W_b)^2 / sum_b W_b^2`` over trials b with total weight ``W_b``
             (at most the number of trials).
 
     Raises:
@@ -52,7 +52,7 @@ class ReturnEvidence:
         return self.hist.sum(-1)
 
     def pooled(self) -> tuple[float, float]:
-        """Return mean and variance of all returns together, states weighted by their weight (0, 0 if none)."""
+        """Return mean and variance of all returns together, by weight; zeros where there is none."""
         weight = self.weight
         total = weight.sum()
         if total <= 0:
@@ -100,9 +100,9 @@ def return_evidence(
     chosen = np.zeros(len(returns), int) if actions is None else np.asarray(actions)
     weights = np.asarray(beliefs, float)[:, :, None] * np.eye(num_actions)[chosen][:, None, :]
     hist = np.einsum("tnk,tb->nkb", weights, np.eye(bins)[place])
-    total = weights.sum(0)
-    mean = np.einsum("tnk,t->nk", weights, returns) / np.where(total > 0, total, 1)
-    var = np.einsum("tnk,tnk->nk", weights, (returns[:, None, None] - mean) ** 2) / np.where(total > 0, total, 1)
+    divisor = np.where(weights.sum(0) > 0, weights.sum(0), 1)
+    mean = np.einsum("tnk,t->nk", weights, returns) / divisor
+    var = np.einsum("tnk,tnk->nk", weights, (returns[:, None, None] - mean) ** 2) / divisor
     effective = _effective(weights, np.arange(len(returns)) if trial is None else np.asarray(trial))
     return ReturnEvidence(edges, bin_centres(returns, weights.sum((1, 2)), edges), hist, mean, var, effective)
 
@@ -113,7 +113,7 @@ def bin_of(returns: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def bin_centres(returns: np.ndarray, weights: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return the weighted mean of the returns in each bin, ``[bins]``; the midpoint of a bin that has none."""
+    """Return the weighted mean of the returns in each bin, ``[bins]``; the middle of a bin that has none."""
     bins = len(edges) - 1
     place = bin_of(returns, edges)
     mass = np.bincount(place, weights, bins)

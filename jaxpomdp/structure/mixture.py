@@ -1,4 +1,4 @@
-"""Mixtures of Gaussians in one dimension, fitted to weighted values by EM, and how many components are enough."""
+"""Mixtures of Gaussians in one dimension, fitted to weighted values by EM; how many components are enough."""
 
 from __future__ import annotations
 
@@ -58,16 +58,17 @@ def fit_mixture(
     components: int,
     *,
     variance_floor: float = 0.0,
-    iterations: int = 200,
+    iterations: int = 100,
     tolerance: float = 1e-6,
-    restarts: int = 1,
+    restarts: int = 0,
     rng: np.random.Generator | None = None,
 ) -> Mixture:
     """Fit a mixture to values with weights by EM and return the best of the restarts.
 
-    E-step: ``r[i, j] = weight[j] N(x_i; mean[j], var[j]) / p(x_i)``. M-step: moments weighted by ``w_i r[i, j]``.
-    The first start is at the quantiles of the data (no randomness); the others draw centres as k-means++ does.
-    A component left without weight keeps its moments; weights that are all zero give the start back.
+    E-step: ``r[i, j] = weight[j] N(x_i; mean[j], var[j]) / p(x_i)``; M-step: moments under ``w_i r[i, j]``.
+    Two starts need no randomness: centres at the quantiles, and far from each other (so that a rare lump
+    gets one). More are drawn as k-means++ does. A component left without weight keeps its moments; weights
+    that are all zero give the start back.
 
     Args:
         values: ``[I]``.
@@ -76,8 +77,8 @@ def fit_mixture(
         variance_floor: least variance of a component (a tiny share of the data's is always kept).
         iterations: at most so many.
         tolerance: stop when the mean log-likelihood gains less than this.
-        restarts: number of starts, 1 = the quantiles alone.
-        rng: source of the random starts; needed when ``restarts > 1``.
+        restarts: number of random starts besides the two.
+        rng: source of the random starts; needed when there are any.
 
     Raises:
         ValueError: shapes disagree, a weight is negative, or a number is out of range.
@@ -89,12 +90,13 @@ def fit_mixture(
     values, weights = np.asarray(values, float), np.asarray(weights, float)
     _check(values, weights, components, restarts, rng)
     total = float(weights.sum())
-    share = weights / total if total > 0 else weights
+    if total > 0:
+        values, weights = values[weights > 0], weights[weights > 0]
+    share = weights / (total or 1.0)
     floor = _floor(values, share, variance_floor)
-    starts = [_quantile_centres(values, share, components)]
-    starts += [_random_centres(values, share, components, rng) for _ in range(restarts - 1) if rng is not None]
-    fits = [_climb(values, share, centres, floor, iterations, tolerance) for centres in starts]
-    best = max(fits, key=lambda fit: fit.log_likelihood)
+    starts = [_quantile_centres(values, share, components), _far_centres(values, share, components)]
+    starts += [_far_centres(values, share, components, rng) for _ in range(restarts)]
+    best = _climb(values, share, np.array(starts), floor, iterations, tolerance)
     return replace(best, log_likelihood=best.log_likelihood * total)
 
 
@@ -128,10 +130,10 @@ def fewest_acceptable(
     significance: float = 0.05,
     cells: int | None = None,
     variance_floor: float = 0.0,
-    restarts: int = 1,
+    restarts: int = 0,
     rng: np.random.Generator | None = None,
 ) -> tuple[Mixture, bool]:
-    """Fit mixtures of rising size; return the first that chi-square does not reject (thesis 3.3) and ``True``.
+    """Fit mixtures of rising size; return the first that chi-square accepts (thesis 3.3) and ``True``.
 
     When all are rejected: the one with the best BIC, and ``False``.
 
@@ -160,13 +162,14 @@ def _check(
     values: np.ndarray, weights: np.ndarray, components: int, restarts: int, rng: np.random.Generator | None
 ) -> None:
     if values.ndim != 1 or values.shape != weights.shape or not len(values):
-        raise ValueError(f"values and weights must be two [I] arrays, I > 0, got {values.shape}, {weights.shape}")
+        shapes = f"{values.shape} and {weights.shape}"
+        raise ValueError(f"values and weights must have one shape [I], I > 0, got {shapes}")
     if not (np.isfinite(values).all() and np.isfinite(weights).all() and (weights >= 0).all()):
         raise ValueError("values must be finite, and weights finite and not negative")
-    if components < 1 or restarts < 1:
-        raise ValueError(f"components and restarts must be at least 1, got {components} and {restarts}")
-    if restarts > 1 and rng is None:
-        raise ValueError(f"rng must be given when restarts={restarts} exceeds 1")
+    if components < 1 or restarts < 0:
+        raise ValueError(f"components must be at least 1 and restarts 0, got {components} and {restarts}")
+    if restarts and rng is None:
+        raise ValueError(f"rng must be given for restarts={restarts}")
 
 
 def _floor(values: np.ndarray, share: np.ndarray, floor: float) -> float:
@@ -184,60 +187,83 @@ def _quantile_centres(values: np.ndarray, share: np.ndarray, components: int) ->
     return values[order][np.minimum(np.searchsorted(reached, wanted), len(values) - 1)]
 
 
-def _random_centres(
-    values: np.ndarray, share: np.ndarray, components: int, rng: np.random.Generator
+def _far_centres(
+    values: np.ndarray, share: np.ndarray, components: int, rng: np.random.Generator | None = None
 ) -> np.ndarray:
-    """Draw centres one by one, likelier the farther from those drawn (k-means++, Arthur and Vassilvitskii 2007)."""
+    """Choose centres one by one in proportion to weight x squared distance from those chosen (k-means++).
+
+    Arthur and Vassilvitskii 2007; without ``rng`` the most likely value is taken each time.
+    """
     chance = share
     centres: list[float] = []
     for _ in range(components):
         total = chance.sum()
-        centres.append(float(rng.choice(values, p=chance / total if total > 0 else None)))
+        even = np.full(len(values), 1 / len(values))
+        likely = chance / total if total > 0 else even
+        centres.append(float(values[likely.argmax()] if rng is None else rng.choice(values, p=likely)))
         chance = share * ((values[:, None] - np.array(centres)) ** 2).min(1)
     return np.array(centres)
 
 
 def _climb(
-    values: np.ndarray, share: np.ndarray, centres: np.ndarray, floor: float, iterations: int, tolerance: float
+    values: np.ndarray,
+    share: np.ndarray,
+    centres: np.ndarray,
+    floor: float,
+    iterations: int,
+    tolerance: float,
 ) -> Mixture:
-    """Run EM from centres: weight even, each variance that of the values nearest to the centre."""
-    nearest = np.abs(values[:, None] - centres).argmin(1)
-    hard = np.eye(len(centres))[nearest] * share[:, None]
-    even = np.full(len(centres), 1 / len(centres))
-    spread = np.full(len(centres), max((values - values @ share) ** 2 @ share, floor))
-    weight, mean, var = _maximise(values, hard, (even, centres, spread), floor)
-    last = -np.inf
+    """Run EM from all starts ``centres[R, m]`` at once, until none gains; return the best.
+
+    Even weights at first, and the moments of the values nearest to each centre.
+    """
+    components = centres.shape[-1]
+    nearest = np.abs(values[:, None] - centres[:, None]).argmin(-1)
+    even, spread = np.full(centres.shape, 1 / components), max((values - values @ share) ** 2 @ share, floor)
+    hard = np.eye(components)[nearest] * share[:, None]
+    _, mean, var = _maximise(values, hard, (even, centres, np.full(centres.shape, spread)), floor)
+    weight, last = even, -np.inf
     for step in range(iterations + 1):
-        log_joint = _log_joint(values, weight, mean, var)
-        log_density = special.logsumexp(log_joint, axis=1)
-        now = float(share @ log_density)
-        if now - last < tolerance or step == iterations:
+        soft, log_density = _responsibilities(values, weight, mean, var)
+        now = log_density @ share
+        if step == iterations or (now - last < tolerance).all():
             break
         last = now
-        soft = np.exp(log_joint - log_density[:, None]) * share[:, None]
+        soft *= share[:, None]
         weight, mean, var = _maximise(values, soft, (weight, mean, var), floor)
-    order = np.argsort(mean, kind="stable")
-    return Mixture(weight[order], mean[order], var[order], now, step)
+    best = int(now.argmax())
+    order = np.argsort(mean[best], kind="stable")
+    return Mixture(weight[best][order], mean[best][order], var[best][order], float(now[best]), step)
 
 
-def _log_joint(values: np.ndarray, weight: np.ndarray, mean: np.ndarray, var: np.ndarray) -> np.ndarray:
-    """Return ``log weight[j] + log N(x_i; mean[j], var[j])``, ``[I, m]``."""
-    log_weight = np.log(np.maximum(weight, np.finfo(float).tiny))
-    return log_weight - 0.5 * (np.log(2 * np.pi * var) + (values[:, None] - mean) ** 2 / var)
+def _responsibilities(
+    values: np.ndarray, weight: np.ndarray, mean: np.ndarray, var: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``p(j | x_i)``, ``[R, I, m]``, and ``log p(x_i)``, ``[R, I]``."""
+    constant = np.log(np.maximum(weight, np.finfo(float).tiny)) - 0.5 * np.log(2 * np.pi * var)
+    away = (values[:, None] - mean[:, None]) ** 2
+    log_joint = constant[:, None] - away * (0.5 / var)[:, None]
+    peak = log_joint.max(-1)
+    joint = np.exp(log_joint - peak[..., None])
+    total = joint.sum(-1)
+    joint /= total[..., None]
+    return joint, peak + np.log(total)
 
 
 def _maximise(
     values: np.ndarray, soft: np.ndarray, old: tuple[np.ndarray, np.ndarray, np.ndarray], floor: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return weights, means and variances from ``soft[I, m]``; a component without weight keeps its moments."""
-    mass = soft.sum(0)
-    if mass.sum() <= 0:
+    """Return weights, means, variances ``[R, m]`` from ``soft[R, I, m]``; a weightless component stays."""
+    mass = soft.sum(1)
+    total = mass.sum(-1, keepdims=True)
+    if not total.all():
         return old
-    alive = mass > LEAST_MASS * mass.sum()
+    alive = mass > LEAST_MASS * total
     divisor = np.where(alive, mass, 1)
     mean = np.where(alive, values @ soft / divisor, old[1])
-    var = np.where(alive, ((values[:, None] - mean) ** 2 * soft).sum(0) / divisor, old[2])
-    return mass / mass.sum(), mean, np.maximum(var, floor)
+    squares = np.einsum("rim,rim->rm", (values[:, None] - mean[:, None]) ** 2, soft)
+    var = np.where(alive, squares / divisor, old[2])
+    return mass / total, mean, np.maximum(var, floor)
 
 
 def _merge_lightest(

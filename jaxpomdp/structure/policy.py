@@ -1,4 +1,4 @@
-"""Which edits are made in a phase: budget, node cap and rest for what was edited lately; and the log of them."""
+"""Which edits are made in a phase: budget, node cap, rest for what was edited lately; and their log."""
 
 from __future__ import annotations
 
@@ -28,6 +28,10 @@ class PolicyConfig:
     """phases for which a state that was edited (and its copies) is left alone"""
 
 
+STATE_SPLITS = ((STATE_SPLIT, SplitConfig()),)
+"""The flat model's operators (thesis 3.3), at their defaults."""
+
+
 class Revision(NamedTuple):
     """A spec after a phase's edits.
 
@@ -51,7 +55,7 @@ def revise(
     phase: int,
     rest: np.ndarray | None = None,
     policy: PolicyConfig = PolicyConfig(),
-    operators: Sequence[tuple[Operator, Any]] = ((STATE_SPLIT, SplitConfig()),),
+    operators: Sequence[tuple[Operator, Any]] = STATE_SPLITS,
     rng: np.random.Generator | None = None,
 ) -> Revision:
     """Let the operators, in order, propose edits and apply the best that the policy allows.
@@ -89,11 +93,12 @@ def _choose(
     rng: np.random.Generator | None,
 ) -> list[tuple[Operator, Edit]]:
     """Collect edits up to the budget, no two of one state, shrunk to the room that is left."""
-    room, chosen, taken = policy.node_cap - spec.num_states, [], resting.copy()
+    room, taken = policy.node_cap - spec.num_states, resting.copy()
+    chosen: list[tuple[Operator, Edit]] = []
     for operator, config in operators:
         allowance = Allowance(room, policy.edits_per_phase - len(chosen), taken, rng)
         for edit in operator.propose(spec, evidence, config, allowance):
-            fitting = operator.shrink(edit, room)
+            fitting = operator.shrink(edit, room) if room > 0 else None
             if fitting is not None:
                 chosen.append((operator, fitting))
                 room -= len(fitting.copied)

@@ -1,8 +1,8 @@
 """Chi-square tests on weighted histograms, vectorised over leading axes, and corrections for many tests.
 
 Every test forms ``X^2 = sum_cells (observed - expected)^2 / expected`` and compares it with a chi-square
-distribution. Weights may be fractions (expected counts under a belief). Neighbouring bins are merged into cells
-until each expects enough, since the approximation needs an expected count of about five (Cochran 1954).
+distribution. Weights may be fractions (expected counts under a belief). Neighbouring bins are merged into
+cells until each expects enough, since the approximation needs an expected count of about five (Cochran 1954).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class ChiSquare(NamedTuple):
         statistic: ``X^2``.
         dof: degrees of freedom; below one nothing could be tested, and ``p_value`` is 1.
         p_value: chance of a statistic at least as large under the hypothesis.
-        effect: size of the deviation whatever the weight: Cohen's w = sqrt(X^2 / weight) against a distribution,
-            Cramer's V in [0, 1] for tables.
+        effect: size of the deviation whatever the weight: Cohen's w = sqrt(X^2 / weight) against a
+            distribution, Cramer's V in [0, 1] for tables.
     """
 
     statistic: np.ndarray
@@ -160,7 +160,8 @@ def homogeneity(counts: np.ndarray, *, ordered: bool = False, least_expected: fl
     """Test whether the rows of weighted tables ``counts[..., R, C]`` share one distribution.
 
     Expected = row total x column total / total; dof = (R - 1)(cells - 1), rows without weight left out.
-    Columns in which the lightest row expects too little are pooled: with neighbours if ``ordered``, else rare with rare.
+    Columns in which the lightest row expects too little are pooled: with neighbours if ``ordered``, else rare
+    with rare.
 
     >>> result = homogeneity(np.array([[30.0, 10.0], [10.0, 30.0]]))
     >>> float(result.statistic), int(result.dof), float(result.effect)
@@ -182,7 +183,7 @@ def homogeneity(counts: np.ndarray, *, ordered: bool = False, least_expected: fl
 
 
 def two_sample(left: np.ndarray, right: np.ndarray, *, least_expected: float = 5.0) -> ChiSquare:
-    """Test whether two binned samples ``[..., bins]`` on one grid come from one distribution (thesis 6.3.2)."""
+    """Test whether two binned samples ``[..., bins]`` on one grid share a distribution (thesis 6.3.2)."""
     return homogeneity(np.stack([left, right], axis=-2), ordered=True, least_expected=least_expected)
 
 

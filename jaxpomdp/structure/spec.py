@@ -1,4 +1,4 @@
-"""A flat model as a value: ragged (no padding), immutable, printable; what the structure edits read and write."""
+"""A flat model as a value: ragged (no padding), immutable, printable; what edits read and write."""
 
 from __future__ import annotations
 
@@ -75,7 +75,9 @@ class Channel:
         return Channel(self.kind, {name: value[origin] for name, value in self.values.items()})
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Channel) and self.kind == other.kind and _equal_maps(self.values, other.values)
+        if not isinstance(other, Channel):
+            return NotImplemented
+        return self.kind == other.kind and _equal_maps(self.values, other.values)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -197,7 +199,8 @@ def _expect_rows(name: str, log_prob: np.ndarray) -> None:
     totals = np.exp(log_prob).sum(-1)
     wrong = np.abs(totals - 1) > ROW_TOLERANCE
     if wrong.any():
-        raise ValueError(f"{name}: probabilities must sum to 1, got {totals[wrong][0]:.6g} in row {_first(wrong)}")
+        total, row = totals[wrong][0], _first(wrong)
+        raise ValueError(f"{name}: probabilities must sum to 1, got {total:.6g} in row {row}")
 
 
 def _check_shapes(spec: FlatSpec) -> None:

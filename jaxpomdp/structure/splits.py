@@ -10,13 +10,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from jaxpomdp.structure.edits import (
+    UNLIMITED,
     Allowance,
     Edit,
     Operator,
     Shares,
     clone_state,
     even_shares,
-    grown,
     jittered,
     sticky_among,
 )
@@ -37,13 +37,13 @@ class SplitConfig:
     correction: Correction = "holm"
     """correction for testing many states at once: none, bonferroni, holm or benjamini-hochberg"""
     count: Literal["weight", "effective"] = "weight"
-    """what counts as one return: every step (the thesis), or every trial, since a trial's returns are alike"""
+    """what counts as one return: every step (the thesis), or every trial, whose returns are alike"""
     minimum_weight: float = 30.0
     """least count of returns in a state"""
     minimum_effect: float = 0.0
     """least Cohen's w = sqrt(X^2 / count): how far from Gaussian, whatever the count"""
     minimum_spread: float = 0.02
-    """least standard deviation of a state's return, in units of that of all returns; below, it is deterministic"""
+    """least standard deviation of a state's return, in units of that of all returns; less is deterministic"""
     cells: int = 10
     """cells of equal probability that the test uses at most"""
     components: tuple[int, ...] = (2, 3, 4)
@@ -57,14 +57,14 @@ class SplitConfig:
     rank: Literal["statistic", "effect", "likelihood", "spread"] = "statistic"
     """which states go first: by X^2, by effect, by log-likelihood gained, by count times variance"""
     shares: Literal["even", "weights"] = "even"
-    """how incoming probability is shared among the copies: evenly (the thesis), or as the mixture's weights"""
+    """how incoming probability is shared among copies: evenly (the thesis), or as the mixture's weights"""
     stay: float | None = None
     """share of a self-transition that a copy keeps to itself (sticky: 0.9); None: shared like the rest"""
     jitter: float = 0.1
-    """log-scale of random differences between the shares of different predecessors, so that Baum-Welch can tell
-    copies apart where theta is zero; drawn only where a source of random numbers is given"""
+    """log-scale of random differences between the shares of different predecessors, so that Baum-Welch can
+    tell copies apart where theta is zero; drawn only where a source of random numbers is given"""
     other_actions: Literal["copy", "shift"] = "shift"
-    """returns of the actions the split was not found for: kept, or moved by as much as the component's mean"""
+    """returns of actions the split was not found for: kept, or moved by as much as the component's mean"""
 
 
 class StateSplit(NamedTuple):
@@ -105,7 +105,7 @@ def propose_splits(
     spec: FlatSpec,
     evidence: ReturnEvidence,
     config: SplitConfig = SplitConfig(),
-    allowance: Allowance = Allowance(),
+    allowance: Allowance = UNLIMITED,
 ) -> list[Edit]:
     """Return the splits that the evidence calls for, best first (thesis 3.3).
 
@@ -124,10 +124,11 @@ def propose_splits(
     tests = examine_states(evidence, config, allowance.free(spec.num_states))
     places = [(int(n), int(k)) for n, k in np.argwhere(tests.significant)]
     if config.rank == "likelihood":
-        return _best_by_likelihood(_edits(spec, evidence, config, allowance, tests, places))[: allowance.edits]
+        edits = _edits(evidence, config, allowance, tests, places)
+        return _best_by_score(edits)[: allowance.edits]
     scores = _scores(tests, evidence, config)
     ranked = _first_of_each_state(sorted(places, key=lambda place: -scores[place]))
-    return list(islice(_edits(spec, evidence, config, allowance, tests, ranked, scores), allowance.edits))
+    return list(islice(_edits(evidence, config, allowance, tests, ranked, scores), allowance.edits))
 
 
 class StateTests(NamedTuple):
@@ -139,7 +140,9 @@ class StateTests(NamedTuple):
     significant: np.ndarray
 
 
-def examine_states(evidence: ReturnEvidence, config: SplitConfig, free: np.ndarray | None = None) -> StateTests:
+def examine_states(
+    evidence: ReturnEvidence, config: SplitConfig, free: np.ndarray | None = None
+) -> StateTests:
     """Test the return of every state (and action) for normality, corrected for the number of tests made.
 
     Args:
@@ -184,13 +187,12 @@ def apply_split(spec: FlatSpec, edit: Edit) -> FlatSpec:
     return replace(cloned, return_mean=mean, return_var=var)
 
 
-def shrink_split(edit: Edit, room: int) -> Edit | None:
-    """Return the split with at most ``room`` new states: the lightest components join their neighbours."""
-    if room < 1:
-        return None
+def shrink_split(edit: Edit, room: int) -> Edit:
+    """Return the split with at most ``room >= 1`` new states: the lightest components join others."""
     split: StateSplit = edit.details
     mixture = split.mixture.merged(room + 1)
-    return replace(edit, copied=(edit.node,) * (mixture.components - 1), details=split._replace(mixture=mixture))
+    copied = (edit.node,) * (mixture.components - 1)
+    return replace(edit, copied=copied, details=split._replace(mixture=mixture))
 
 
 STATE_SPLIT = Operator(KIND, propose_splits, shrink_split, apply_split)
@@ -210,7 +212,7 @@ def _first_of_each_state(places: Iterable[tuple[int, int]]) -> list[tuple[int, i
     return list(columns.items())
 
 
-def _best_by_likelihood(edits: Iterable[Edit]) -> list[Edit]:
+def _best_by_score(edits: Iterable[Edit]) -> list[Edit]:
     """Return the best edit of each state, best first."""
     best: dict[int, Edit] = {}
     for edit in sorted(edits, key=lambda edit: -edit.score):
@@ -219,7 +221,6 @@ def _best_by_likelihood(edits: Iterable[Edit]) -> list[Edit]:
 
 
 def _edits(
-    spec: FlatSpec,
     evidence: ReturnEvidence,
     config: SplitConfig,
     allowance: Allowance,
@@ -231,36 +232,42 @@ def _edits(
 
     Without ``scores`` the score is the log-likelihood that the mixture gains over one Gaussian.
     """
-    for state, column in places:
-        counts = tests.counts[state, column]
+    for place in places:
+        counts = tests.counts[place]
         mixture, accepted = _mixture(counts, evidence, config)
-        if mixture.components < 2:
-            continue
-        gain = mixture.log_likelihood - fit_mixture(evidence.centres, counts, 1).log_likelihood
-        seed = 0 if allowance.rng is None else int(allowance.rng.integers(2**31))
-        details = StateSplit(
-            column,
-            mixture,
-            accepted,
-            config.other_actions == "shift",
-            config.shares == "even",
-            config.stay,
-            0.0 if allowance.rng is None else config.jitter,
-            seed,
-        )
-        edit = Edit(
-            KIND,
-            state,
-            spec.num_states,
-            (state,) * (mixture.components - 1),
-            float(gain if scores is None else scores[state, column]),
-            float(tests.result.statistic[state, column]),
-            float(tests.adjusted[state, column]),
-            float(tests.result.effect[state, column]),
-            float(counts.sum()),
-            details,
-        )
-        yield shrink_split(edit, allowance.room) or edit
+        if mixture.components >= 2:
+            score = _gain(mixture, counts, evidence) if scores is None else float(scores[place])
+            split = _split(place[1], mixture, accepted, config, allowance.rng)
+            yield shrink_split(_edit(tests, place, score, split), allowance.room)
+
+
+def _edit(tests: StateTests, place: tuple[int, int], score: float, split: StateSplit) -> Edit:
+    state = place[0]
+    return Edit(
+        KIND,
+        state,
+        len(tests.counts),
+        (state,) * (split.mixture.components - 1),
+        score,
+        float(tests.result.statistic[place]),
+        float(tests.adjusted[place]),
+        float(tests.result.effect[place]),
+        float(tests.counts[place].sum()),
+        split,
+    )
+
+
+def _split(
+    column: int, mixture: Mixture, accepted: bool, config: SplitConfig, rng: np.random.Generator | None
+) -> StateSplit:
+    seed = 0 if rng is None else int(rng.integers(2**31))
+    jitter = 0.0 if rng is None else config.jitter
+    even, shift = config.shares == "even", config.other_actions == "shift"
+    return StateSplit(column, mixture, accepted, shift, even, config.stay, jitter, seed)
+
+
+def _gain(mixture: Mixture, counts: np.ndarray, evidence: ReturnEvidence) -> float:
+    return mixture.log_likelihood - fit_mixture(evidence.centres, counts, 1).log_likelihood
 
 
 def _mixture(counts: np.ndarray, evidence: ReturnEvidence, config: SplitConfig) -> tuple[Mixture, bool]:
@@ -282,7 +289,7 @@ def _shares(spec: FlatSpec, split: StateSplit) -> Shares:
     """Return the shares of a split, jittered per action and predecessor."""
     shares, copies = split.shares, split.mixture.components
     incoming = np.broadcast_to(shares, (spec.num_actions, spec.num_states, copies))
-    rows = np.broadcast_to(shares, (copies, copies)) if split.stay is None else sticky_among(shares, split.stay)
+    rows = shares if split.stay is None else sticky_among(shares, split.stay)
     among = np.broadcast_to(rows, (spec.num_actions, copies, copies))
     if split.jitter == 0:
         return Shares(shares, incoming, among)
