@@ -21,8 +21,8 @@ S*****S
 S*****S
 """
 """A RECONSTRUCTION of Figure 3.3: the map of 1995 is in no public text that was found. It keeps what is
-known: starts in four corners, the goal in the centre, many cells that look alike. The best path is 5 steps from each
-corner; an average of exactly 7 means that two corners take the long way."""
+known: starts in four corners, the goal in the centre, many cells that look alike. The best path is 5 steps
+from each corner; an average of exactly 7 means that two corners take the long way."""
 
 
 def hallway_navigation(step_limit: int = 251) -> World:

@@ -26,7 +26,7 @@ def tmaze(
 
     The signal, up or down with even odds, shows at the start only (also on coming back to it); every corridor
     cell looks the same; at the junction north leads to the upper end and south to the lower one, and the
-    trial is over. The best path takes ``length + 1`` actions. State ``2 * position + signal``, then the two ends.
+    trial is over. The best path takes ``length + 1`` actions. State ``2 * position + signal``, then two ends.
 
     Args:
         length: ``N``, at least 1.

@@ -9,13 +9,13 @@ position in a batch.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpomdp._types import Array, pytree
+from jaxpomdp._types import Array
 
 UNIFORMS_PER_RESET = 2
 """How many numbers ``reset`` consumes: for the state, for the observation."""
@@ -39,11 +39,12 @@ class Layout:
     headings: tuple[int, ...]
 
 
-def _static(default: object) -> object:
+def _static(default: Any) -> Any:
     return dataclasses.field(default=default, metadata={"static": True})
 
 
-@pytree
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
 class World:
     """The tables of a partially observable world with ``N`` states, ``A`` actions and ``O`` observations.
 
