@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxpomdp._types import Array
-from jaxpomdp.numerics import NEG, safe_log
+from jaxpomdp.models.family import Prior
+from jaxpomdp.numerics import NEG, log_normalise, safe_log
 
 LOG_TWO_PI = 1.8378770664093453
+LEAST_FLOOR = 1e-9
+"""A variance is never below this share of that of all the data: a density must stay finite."""
 
 
 class Moments(NamedTuple):
@@ -22,6 +25,17 @@ class Moments(NamedTuple):
     weight: Array
     mean: Array
     scatter: Array
+
+
+def weighted_sums(gamma: Array, features: Array) -> Array:
+    """Return ``[F, N]``: the sum over all steps of ``features[..., F]`` times ``gamma[..., N]``.
+
+    The barrier keeps XLA from moving a later transpose into the product, which makes it three times slower.
+    """
+    rows = gamma.reshape(-1, gamma.shape[-1])
+    columns = features.reshape(rows.shape[0], -1)
+    sums = jnp.einsum("tf,tn->fn", columns, rows, precision="highest")
+    return jax.lax.optimization_barrier(sums)
 
 
 def dirichlet_mode(old: Array, counts: Array, pseudo: float | Array) -> Array:
@@ -39,23 +53,34 @@ def dirichlet_score(log_prob: Array, counts: float | Array) -> Array:
     return jnp.sum(jnp.where(log_prob > NEG / 2, counts * log_prob, 0), axis=-1)
 
 
+def free_rows(old: Array, logits: Array) -> Array:
+    """Return ``log softmax(logits)`` over the entries that are possible in ``old``; zeros stay."""
+    return log_normalise(jnp.where(old > NEG / 2, logits, NEG))
+
+
+def count_free_entries(log_prob: Array) -> Array:
+    """Return how many entries of each row are free: the possible ones, less one for the sum."""
+    return jnp.maximum(jnp.sum(log_prob > NEG / 2, axis=-1) - 1, 0)
+
+
 def moments_from_sums(weight: Array, first: Array, second: Array, centre: Array) -> Moments:
-    """Turn weighted sums of ``x - centre`` and of its square (or outer product) into moments."""
+    """Turn weighted sums of ``x - centre`` and of its square (or outer product) into moments.
+
+    With a centre amid the data float32 loses nothing that the variance floor would not hide.
+    """
     mean = first / jnp.where(weight > 0, weight, 1)
     if second.ndim > first.ndim:
-        spread = second - first[..., :, None] * mean[..., None, :]
-    else:
-        spread = jnp.maximum(second - first * mean, 0)
-    return Moments(weight, mean + centre, spread)
+        return Moments(weight, mean + centre, second - first[..., :, None] * mean[..., None, :])
+    return Moments(weight, mean + centre, jnp.maximum(second - first * mean, 0))
 
 
 def pooled_moments(x: Array, mask: Array) -> Moments:
     """Return the moments ``[1, D]`` of all the rows ``x[..., D]`` where ``mask[...]``."""
+    here = mask.reshape(-1, 1)
     rows = x.reshape(-1, x.shape[-1])
-    weight = mask.reshape(-1, 1).astype(x.dtype)
-    total = jnp.sum(weight, axis=0, keepdims=True)
-    mean = jnp.sum(weight * rows, axis=0, keepdims=True) / jnp.maximum(total, 1)
-    return Moments(total, mean, jnp.sum(weight * (rows - mean) ** 2, axis=0, keepdims=True))
+    total = jnp.sum(here.astype(x.dtype), axis=0, keepdims=True)
+    mean = jnp.sum(jnp.where(here, rows, 0), axis=0, keepdims=True) / jnp.maximum(total, 1)
+    return Moments(total, mean, jnp.sum(jnp.where(here, rows - mean, 0) ** 2, axis=0, keepdims=True))
 
 
 def pooled_variance(pooled: Moments) -> Array:
@@ -64,15 +89,40 @@ def pooled_variance(pooled: Moments) -> Array:
     return jnp.maximum(variance, 1e-6 * pooled.mean**2 + 1e-12)
 
 
-def variance_mode(old: Array, moments: Moments, pooled: Array, floor: float, strength: float) -> Array:
+def centred(x: Array, mask: Array) -> tuple[Array, Array]:
+    """Return ``mask[..., 1]`` as numbers, and ``x[..., D]`` less the data's mean, zero where not ``mask``."""
+    here = mask[..., None]
+    mean = jnp.broadcast_to(pooled_moments(x, mask).mean[0], x.shape)
+    return here.astype(x.dtype), jnp.where(here, x - mean, 0)
+
+
+def floor_share(prior: Prior) -> float:
+    """Return the least variance in units of that of all the data."""
+    return max(prior.variance_floor, LEAST_FLOOR)
+
+
+def variance_mode(old: Array, moments: Moments, pooled: Array, prior: Prior) -> Array:
     """Return the variances that maximise the data's and the inverse gamma prior's density above a floor.
 
     ``(scatter + strength * pooled) / (weight + strength)``, at least ``floor * pooled``; ``old`` where there
     is neither weight nor prior.
     """
+    strength = prior.variance_strength
     weight = moments.weight + strength
     mode = (moments.scatter + strength * pooled) / jnp.where(weight > 0, weight, 1)
-    return jnp.maximum(jnp.where(weight > 0, mode, old), floor * pooled)
+    return jnp.maximum(jnp.where(weight > 0, mode, old), floor_share(prior) * pooled)
+
+
+def lift_covariance(cov: Array, least: Array) -> Array:
+    """Return the likeliest covariances ``[N, D, D]`` with ``cov >= diag(least[D])``: eigenvalues are clipped.
+
+    The clipping is done in coordinates where the limit is the identity.
+    """
+    scale = jnp.sqrt(least)
+    outer = scale[:, None] * scale[None, :]
+    values, vectors = jnp.linalg.eigh(cov / outer[None])
+    lifted = vectors * jnp.maximum(values, 1)[..., None, :]
+    return jnp.einsum("nij,nkj->nik", lifted, vectors, precision="highest") * outer[None]
 
 
 def gaussian_score(mean: Array, variance: Array, moments: Moments) -> Array:
@@ -92,8 +142,7 @@ def _merge(a: Moments, b: Moments) -> Moments:
     delta = b.mean - a.mean
     outer = a.scatter.ndim > a.mean.ndim
     square = delta[..., :, None] * delta[..., None, :] if outer else delta**2
-    between = a.weight * share
-    between = between[..., None] if outer else between
+    between = (a.weight * share)[..., None] if outer else a.weight * share
     return Moments(weight, a.mean + share * delta, a.scatter + b.scatter + between * square)
 
 

@@ -1,7 +1,8 @@
 """The contract between a model and inference: ``Family``, a tuple of functions, one per kind of model.
 
-Every function is written for ONE model; batches of trials are leading axes of the data, and batches of models
-(``S``) are a ``vmap`` at the call site (``models/em.py``). Inference sees only a ``Chain`` and ``log_obs``.
+Every function is written for ONE model; batches of trials are leading axes of the data, and batches of
+models (``S``) are a ``vmap`` at the call site (``models/em.py``). Inference sees only what ``acting`` or
+``learning`` give, and ``posterior`` turns that into what ``statistics`` takes.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from jaxpomdp._types import Array, Chain
+from jaxpomdp.kernels.posterior import posterior
 
 PARTS = ("init", "transitions", "emissions", "returns")
 """The names that ``Prior.freeze`` takes."""
@@ -35,11 +37,11 @@ class Prior:
     observation: float = 0.001
     """Pseudo-count of every possible observation in every state."""
     variance_floor: float = 0.001
-    """Least variance of a state, in units of the variance of all the data."""
+    """Least variance of a state, in units of the variance of all the data (never less than 1e-9)."""
     variance_strength: float = 0.0
     """Pseudo-observations that say a state varies as much as all the data (an inverse gamma prior)."""
     freeze: tuple[str, ...] = ()
-    """Parts that EM leaves alone, among init, transitions, emissions and returns."""
+    """Parts that learning leaves alone, among init, transitions, emissions and returns."""
 
     def __post_init__(self) -> None:
         """Refuse strengths and names that mean nothing."""
@@ -54,6 +56,8 @@ class Prior:
 class Family(NamedTuple):
     """The functions that make a parameter pytree a model. All are pure, and all are for one model.
 
+    The pytree has a leaf ``alive``: bool ``[N]``, the state exists.
+
     Attributes:
         name: what the family is called in stored files.
         acting: ``params -> Chain``; what an agent uses while it acts, without returns.
@@ -61,8 +65,8 @@ class Family(NamedTuple):
             observations in each state. A missing step is a row of zeros; an absent state is ``NEG``.
         learning: ``(params, batch, theta) -> (Chain, log_obs[..., N])``; as above with ``theta`` times the
             log density of the return added wherever the batch has one.
-        constrain: ``(params, batch, prior) -> params``; the nearest parameters that respect the limits which
-            the data set (variance floors). EM starts there, and is monotone from there on.
+        feasible: ``(params, batch, prior, carry) -> params``; the nearest parameters that respect the limits
+            which the data set (variance floors). ``carry`` is None or statistics that count as data.
         statistics: ``(params, batch, posterior) -> statistics``; expected sufficient statistics of the batch.
             ``add_statistics`` adds them up.
         m_step: ``(params, statistics, prior) -> params``; the parameters that maximise ``expected`` plus
@@ -70,14 +74,27 @@ class Family(NamedTuple):
         log_prior: ``(params, statistics, prior, theta) -> []``; log density of the prior, up to a constant.
         expected: ``(params, statistics, theta) -> []``; expected complete-data log-likelihood of statistics;
             it makes carried statistics a prior.
+        to_free: ``params -> pytree`` of unconstrained arrays (logits, log variances), for gradients.
+        from_free: ``(params, free, prior) -> params``; the way back. Structural zeros and frozen parts are
+            those of ``params``.
+        count_free: ``(params, prior, theta) -> []``; how many numbers the data decide (for BIC).
+        check: ``(params, batch) -> None``; raises a ``ValueError`` that names what does not fit. Host side,
+            leading axes allowed.
+        posterior: ``(chains, log_obs, actions, start, valid, plan) -> Posterior``; inference itself, for
+            ``S`` models at once. The default serves every family that is a chain of ``N`` states.
     """
 
     name: str
     acting: Callable[[Any], Chain]
     log_obs: Callable[[Any, tuple[Array, ...], Array], Array]
-    learning: Callable[..., tuple[Chain, Array]]
-    constrain: Callable[..., Any]
+    learning: Callable[..., tuple[Any, Any]]
+    feasible: Callable[..., Any]
     statistics: Callable[..., Any]
     m_step: Callable[..., Any]
     log_prior: Callable[..., Array]
     expected: Callable[..., Array]
+    to_free: Callable[[Any], Any]
+    from_free: Callable[..., Any]
+    count_free: Callable[..., Array]
+    check: Callable[..., None]
+    posterior: Callable[..., Any] = posterior

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 
 from jaxpomdp._types import Array, Chain, Posterior, TrialBatch, pytree
 from jaxpomdp.models import estimates
+from jaxpomdp.models.checks import check
 from jaxpomdp.models.emission import GaussianStatistics, ReturnModel
 from jaxpomdp.models.family import Family, Prior
 from jaxpomdp.numerics import NEG
@@ -71,20 +73,32 @@ def _learning(params: FlatParams, batch: TrialBatch, theta: float) -> tuple[Chai
     return _acting(params), _mask(params, log_obs)
 
 
-def _constrain(params: FlatParams, batch: TrialBatch, prior: Prior) -> FlatParams:
-    seen, paid = batch.observed & batch.valid, batch.has_return & batch.valid
-    pairs = zip(params.emissions, batch.observations, strict=True)
-    emissions = tuple(channel.constrained(x, seen, prior) for channel, x in pairs)
-    returns = params.returns.constrained(batch.returns, paid, prior)
+def _masks(batch: TrialBatch) -> tuple[Array, Array]:
+    """Return where observations, and where modelled returns, exist."""
+    return batch.observed & batch.valid, batch.has_return & batch.valid
+
+
+def _feasible(params: FlatParams, batch: TrialBatch, prior: Prior, carry: Any) -> FlatParams:
+    seen, paid = _masks(batch)
+    carried = (None,) * len(params.emissions) if carry is None else carry.emissions
+    channels = zip(params.emissions, batch.observations, carried, strict=True)
+    emissions = tuple(channel.feasible(x, seen, prior, extra) for channel, x, extra in channels)
+    returns = params.returns.feasible(batch.returns, paid, prior, None if carry is None else carry.returns)
     return _frozen(params, replace(params, emissions=emissions, returns=returns), prior)
 
 
 def _statistics(params: FlatParams, batch: TrialBatch, posterior: Posterior) -> FlatStatistics:
-    seen, paid = batch.observed & batch.valid, batch.has_return & batch.valid
-    gamma = posterior.gamma
-    pairs = zip(params.emissions, batch.observations, strict=True)
-    emissions = tuple(channel.statistics(x, seen, gamma) for channel, x in pairs)
-    returns = params.returns.statistics(batch.returns, batch.actions, paid, gamma)
+    (seen, paid), gamma = _masks(batch), posterior.gamma
+    channels = list(zip(params.emissions, batch.observations, strict=True))
+    features = [channel.features(x, seen) for channel, x in channels]
+    features.append(params.returns.features(batch.returns, batch.actions, paid))
+    sums = estimates.weighted_sums(gamma, jnp.concatenate(features, axis=-1))
+    ends = list(accumulate(part.shape[-1] for part in features))
+    *parts, last = jnp.split(sums, ends[:-1])
+    emissions = tuple(
+        channel.collect(part, x, seen, gamma) for (channel, x), part in zip(channels, parts, strict=True)
+    )
+    returns = params.returns.collect(last, batch.returns, paid)
     return FlatStatistics(posterior.initial, posterior.xi, emissions, returns)
 
 
@@ -145,5 +159,53 @@ def _expected(params: FlatParams, statistics: FlatStatistics, theta: float) -> A
     return _score(params, rows, emissions, returns)
 
 
-FLAT = Family("flat", _acting, _log_obs, _learning, _constrain, _statistics, _m_step, _log_prior, _expected)
+def _to_free(params: FlatParams) -> dict[str, Any]:
+    return {
+        "init": params.log_init,
+        "transitions": params.log_trans,
+        "emissions": tuple(channel.to_free() for channel in params.emissions),
+        "returns": params.returns.to_free(),
+    }
+
+
+def _from_free(params: FlatParams, free: dict[str, Any], prior: Prior) -> FlatParams:
+    chain = _acting(params)
+    channels = zip(params.emissions, free["emissions"], strict=True)
+    emissions = tuple(channel.from_free(leaves) for channel, leaves in channels)
+    new = FlatParams(
+        estimates.free_rows(chain.log_init, free["init"]),
+        estimates.free_rows(chain.log_trans, free["transitions"]),
+        _keep_absent(params, params.emissions, emissions),
+        _keep_absent(params, params.returns, params.returns.from_free(free["returns"])),
+        params.alive,
+    )
+    return _frozen(params, new, prior)
+
+
+def _count_free(params: FlatParams, prior: Prior, theta: float) -> Array:
+    chain = _acting(params)
+    counts = {
+        "init": estimates.count_free_entries(chain.log_init),
+        "transitions": jnp.sum(estimates.count_free_entries(chain.log_trans)),
+        "emissions": jnp.sum(jnp.where(params.alive, sum(c.count_free() for c in params.emissions), 0)),
+        "returns": jnp.sum(jnp.where(params.alive, params.returns.count_free(), 0)) * (theta > 0),
+    }
+    return jnp.asarray(sum(count for part, count in counts.items() if part not in prior.freeze))
+
+
+FLAT = Family(
+    name="flat",
+    acting=_acting,
+    log_obs=_log_obs,
+    learning=_learning,
+    feasible=_feasible,
+    statistics=_statistics,
+    m_step=_m_step,
+    log_prior=_log_prior,
+    expected=_expected,
+    to_free=_to_free,
+    from_free=_from_free,
+    count_free=_count_free,
+    check=check,
+)
 """The flat model as a family."""
