@@ -1,0 +1,1 @@
+"""Runs: configurations, run directories, statistics, pictures, and the thesis reproduced."""
