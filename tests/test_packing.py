@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import jax
 import numpy as np
@@ -15,28 +16,10 @@ from jaxpomdp.packing import carry, pack, slots_of, unpack, unpack_all
 from jaxpomdp.structure import spec as spec_module
 from jaxpomdp.structure.edits import Shares, clone_state
 from jaxpomdp.structure.spec import Channel, FlatSpec
+from tests.structure.worlds import random_spec as any_random_spec
 
 
-def random_spec(
-    seed: int, n: int, a: int = 2, per_action: bool = False, dtype: type = np.float32
-) -> FlatSpec:
-    rng = np.random.default_rng(seed)
-    channels = [
-        rng.dirichlet(np.ones(3), n).astype(dtype),
-        Channel("DiagonalGaussian", {"mean": rng.normal(size=(n, 2)), "var": rng.gamma(2, size=(n, 2))}),
-    ]
-    channels[1] = Channel("DiagonalGaussian", {k: v.astype(dtype) for k, v in channels[1].values.items()})
-    columns = (n, a if per_action else 1)
-    trans = rng.dirichlet(np.ones(n), (a, n))
-    trans = np.where(trans < 0.1 / n, 0, trans)
-    trans /= trans.sum(-1, keepdims=True)
-    return FlatSpec.from_probabilities(
-        rng.dirichlet(np.ones(n)).astype(dtype),
-        trans.astype(dtype),
-        channels,
-        rng.normal(size=columns).astype(dtype),
-        rng.gamma(2, size=columns).astype(dtype),
-    )
+random_spec = partial(any_random_spec, dtype=np.float32)
 
 
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=4), st.integers(0, 5), st.booleans())
