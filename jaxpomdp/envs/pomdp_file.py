@@ -265,7 +265,7 @@ class _Reader(Cursor):
 
     def _put_matrix(self, table: ProbabilityRows, letter: str, actions: range, word: int) -> None:
         states, kind = range(self.size("states")), self.words[self.at]
-        if kind in ("uniform", "reset"):
+        if kind == "uniform" or (kind == "reset" and letter == "T"):
             return table.put_row(actions, states, self._row(table.width, letter), word)
         if kind == "identity" and table.width == len(states):
             self.at += 1

@@ -41,7 +41,7 @@ class RewardRules(NamedTuple):
         moment = np.stack([np.ravel(x) for x in arrays], axis=-1).astype(np.int64)
         latest = np.full(len(moment), -1, np.int64)
         named = self.index != ANY
-        for kind in {tuple(row) for row in named.tolist()}:
+        for kind in sorted({tuple(row) for row in named.tolist()}):
             rules = np.flatnonzero(np.all(named == kind, axis=1))
             axes = np.flatnonzero(kind)
             latest = np.maximum(latest, _latest(self.index[rules][:, axes], rules, moment[:, axes]))
@@ -54,11 +54,11 @@ def _latest(keys: np.ndarray, rules: np.ndarray, wanted: np.ndarray) -> np.ndarr
     if keys.shape[1] == 0:
         return np.full(len(wanted), rules[-1])
     sizes = np.maximum(keys.max(axis=0), wanted.max(axis=0, initial=0)) + 1
-    flat, flat_wanted = (np.ravel_multi_index(tuple(x.T), tuple(sizes)) for x in (keys, wanted))
-    distinct, reverse_position = np.unique(flat[::-1], return_index=True)
-    last = rules[::-1][reverse_position]
-    place = np.minimum(np.searchsorted(distinct, flat_wanted), len(distinct) - 1)
-    return np.where(distinct[place] == flat_wanted, last[place], -1)
+    flat, flat_wanted = (np.asarray(np.ravel_multi_index(tuple(x.T), tuple(sizes))) for x in (keys, wanted))
+    order = np.argsort(flat, kind="stable")
+    place = np.searchsorted(flat[order], flat_wanted, side="right") - 1
+    found = order[np.maximum(place, 0)]
+    return np.where((place >= 0) & (flat[found] == flat_wanted), rules[found], -1)
 
 
 @dataclass(frozen=True, eq=False)
