@@ -83,6 +83,7 @@ def assemble(
         raise ValueError("first_observation must be given where the observation depends on the action")
     first = observation[0] if first_observation is None else first_observation
     _check(tables, observation, first, start, terminal, static)
+    tables = _trimmed(tables)
     prob, observed, first, begin = (_rows(x) for x in (tables.prob, observation, first, start))
     return World(
         jnp.asarray(tables.successors, jnp.int32),
@@ -95,6 +96,12 @@ def assemble(
         jnp.asarray(reward_noise, jnp.float32),
         **static,
     )
+
+
+def _trimmed(tables: Tables) -> Tables:
+    """Drop the last columns that no row uses."""
+    width = 1 + int(np.flatnonzero(np.any(tables.prob > 0, axis=(0, 1)))[-1])
+    return Tables(*(array[..., :width] for array in tables))
 
 
 def _rows(prob: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ class _Advance(NamedTuple):
     acted: Array
 
 
-def _uniforms(key: Array, tick: Array, count: int) -> Array:
+def _uniforms(key: Array, tick: Array | int, count: int) -> Array:
     return jax.random.uniform(jax.random.fold_in(key, tick), (count,))
 
 
@@ -132,8 +132,8 @@ class WorldVectorEnv(VectorEnv):
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin a trial in every copy; returns observations ``[E]`` and ``info``; ``options`` are unused."""
-        self._copies = _begin(self.world, self._seeds(seed))
-        return _host(self._copies.observation, np.int64), {"state": _host(self._copies.state, np.int64)}
+        copies = self._copies = _begin(self.world, self._seeds(seed))
+        return _host(copies.observation, np.int64), {"state": _host(copies.state, np.int64)}
 
     def _seeds(self, seed: int | Sequence[int] | None) -> np.ndarray:
         if isinstance(seed, int | np.integer) or seed is None:
@@ -156,15 +156,17 @@ class WorldVectorEnv(VectorEnv):
         if self._copies is None:
             raise ValueError("reset must be called before step")
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
-        self._copies, advance = _advance(
-            self.world, self._copies, self._checked(actions), same_step=same_step
-        )
+        copies, advance = _advance(self.world, self._copies, self._checked(actions), same_step=same_step)
+        self._copies = copies
         acted = _host(advance.acted, bool)
         terminated = _host(advance.step.terminated, bool) & acted
         truncated = _host(advance.truncated, bool) & acted
         reward = np.where(acted, _host(advance.step.reward, np.float64), 0.0)
-        info = self._info(advance, reward, terminated, terminated | truncated)
-        return _host(self._copies.observation, np.int64), reward, terminated, truncated, info
+        info: dict[str, Any] = {"state": _host(copies.state, np.int64)}
+        over = terminated | truncated
+        if over.any():
+            info |= self._final(advance, terminated & (reward > self.world.success_above), over)
+        return _host(copies.observation, np.int64), reward, terminated, truncated, info
 
     def _checked(self, actions: Any) -> np.ndarray:
         array = np.asarray(actions)
@@ -173,25 +175,16 @@ class WorldVectorEnv(VectorEnv):
             raise ValueError(f"actions must have {expected}, got {actions}")
         return array.astype(np.int32)
 
-    def _info(
-        self, advance: _Advance, reward: np.ndarray, terminated: np.ndarray, over: np.ndarray
-    ) -> dict[str, Any]:
-        info: dict[str, Any] = {"state": _host(self._copies.state, np.int64)}
-        if not over.any():
-            return info
-        success = {"success": terminated & (reward > self.world.success_above), "_success": over.copy()}
+    def _final(self, advance: _Advance, success: np.ndarray, over: np.ndarray) -> dict[str, Any]:
+        """Return what ``info`` says where a trial is over."""
+        ended = {"success": success, "_success": over.copy()}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            return info | success
+            return ended
         last = _host(advance.step.observation, np.int64)
         final = np.full(self.num_envs, None, dtype=object)
         final[over] = last[over]
-        ended = {"state": _host(advance.step.state, np.int64), "_state": over.copy()}
-        return info | {
-            "final_obs": final,
-            "_final_obs": over,
-            "final_info": ended | success,
-            "_final_info": over,
-        }
+        ended |= {"state": _host(advance.step.state, np.int64), "_state": over.copy()}
+        return {"final_obs": final, "_final_obs": over, "final_info": ended, "_final_info": over.copy()}
 
     def render(self) -> tuple[Any, ...] | None:
         """Return one picture or text a copy."""

@@ -1,15 +1,14 @@
 """Worlds as tables: what an agent acts in, drawn by explicit uniform numbers on the device.
 
-A world is a pytree of arrays, so one compiled program serves every world of its shapes; ``step`` and
-``reset`` are for ONE agent and are lifted by ``jax.vmap`` over seeds while the world is shared. A draw is an
-inverse cumulative distribution at a number in [0, 1) that the caller supplies, so it never depends on the
-position in a batch.
+A world is a pytree of arrays with static names and limits. ``step`` and ``reset`` are for ONE agent and are
+lifted by ``jax.vmap`` over seeds while the world is shared. A draw is an inverse cumulative distribution at a
+number in [0, 1) that the caller supplies, so it never depends on the position in a batch.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,8 +38,7 @@ class Layout:
     headings: tuple[int, ...]
 
 
-def _static(default: Any) -> Any:
-    return dataclasses.field(default=default, metadata={"static": True})
+_STATIC = {"static": True}
 
 
 @jax.tree_util.register_dataclass
@@ -82,14 +80,14 @@ class World:
     start_cdf: Array
     terminal: Array
     reward_noise: Array
-    name: str = _static("world")
-    discount: float = _static(0.95)
-    step_limit: int = _static(251)
-    success_above: float = _static(0.0)
-    action_names: tuple[str, ...] = _static(())
-    observation_names: tuple[str, ...] = _static(())
-    senses: tuple[str, ...] = _static(())
-    layout: Layout | None = _static(None)
+    name: str = dataclasses.field(default="world", metadata=_STATIC)
+    discount: float = dataclasses.field(default=0.95, metadata=_STATIC)
+    step_limit: int = dataclasses.field(default=251, metadata=_STATIC)
+    success_above: float = dataclasses.field(default=0.0, metadata=_STATIC)
+    action_names: tuple[str, ...] = dataclasses.field(default=(), metadata=_STATIC)
+    observation_names: tuple[str, ...] = dataclasses.field(default=(), metadata=_STATIC)
+    senses: tuple[str, ...] = dataclasses.field(default=(), metadata=_STATIC)
+    layout: Layout | None = dataclasses.field(default=None, metadata=_STATIC)
 
     @property
     def num_states(self) -> int:
@@ -182,15 +180,22 @@ def step_key(world: World, state: Array, action: Array, key: Array) -> Step:
 
 
 def model_of(world: World) -> TrueModel:
-    """Return the world as dense tables; ``trans[a, s, s']`` sums the outcomes that lead to ``s'``."""
-    num_actions, num_states = world.num_actions, world.num_states
-    a = jnp.arange(num_actions)[:, None, None]
-    s = jnp.arange(num_states)[None, :, None]
-    empty = jnp.zeros((num_actions, num_states, num_states), world.transition_prob.dtype)
-    trans = empty.at[a, s, world.successors].add(world.transition_prob)
-    reward = jnp.sum(world.transition_prob * world.reward, axis=-1)
+    """Return the world as dense tables; ``trans[a, s, s']`` sums the outcomes that lead to ``s'``.
+
+    Made on the host, so it is not for compiled functions.
+    """
+    successors, prob = np.asarray(world.successors), np.asarray(world.transition_prob)
+    trans = np.zeros((world.num_actions, world.num_states, world.num_states), prob.dtype)
+    a, s, _ = np.indices(successors.shape, sparse=True)
+    np.add.at(trans, (a, s, successors), prob)
+    reward = np.sum(prob * np.asarray(world.reward), axis=-1)
     return TrueModel(
-        trans, world.observation_prob, reward, world.start_prob, world.terminal, world.first_observation_prob
+        jnp.asarray(trans),
+        world.observation_prob,
+        jnp.asarray(reward),
+        world.start_prob,
+        world.terminal,
+        world.first_observation_prob,
     )
 
 
