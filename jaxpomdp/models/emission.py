@@ -7,6 +7,7 @@ channels of a model, and ``collect`` reads the sums. Absent states need finite l
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, Self
 
 import jax
@@ -81,6 +82,10 @@ class Categorical:
         """Return the number of free parameters per state, ``[N]``."""
         return estimates.count_free_entries(self.log_prob)
 
+    def padded(self, spare: int) -> Categorical:
+        """Return the channel with rows for ``spare`` more states."""
+        return Categorical(estimates.pad_states(self.log_prob, spare, -math.log(self.log_prob.shape[-1])))
+
     def check(self, x: np.ndarray, observed: np.ndarray, name: str) -> None:
         """Refuse observations that are not symbols of this channel."""
         symbols = self.log_prob.shape[-1]
@@ -130,6 +135,10 @@ class _MeanAndVariance:
     def count_free(self) -> Array:
         """Return the number of free parameters per state, ``[N]``."""
         return jnp.full(self.mean.shape[:1], 2 * self.mean.shape[-1])
+
+    def padded(self, spare: int) -> Self:
+        """Return the channel with rows for ``spare`` more states."""
+        return self._made(estimates.pad_states(self.mean, spare, 0), estimates.pad_states(self.var, spare, 1))
 
 
 @pytree

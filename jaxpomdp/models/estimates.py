@@ -16,6 +16,12 @@ LEAST_FLOOR = 1e-9
 """A variance is never below this share of that of all the data: a density must stay finite."""
 
 
+def pad_states(x: Array, spare: int, fill: float | bool, axes: tuple[int, ...] = (0,)) -> Array:
+    """Return ``x`` with ``spare`` more entries of ``fill`` along the axes of states."""
+    widths = [(0, spare if axis in axes else 0) for axis in range(x.ndim)]
+    return jnp.pad(x, widths, constant_values=fill)
+
+
 class Moments(NamedTuple):
     """Weight, mean and sum of squared deviations of weighted data.
 

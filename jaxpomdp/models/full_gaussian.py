@@ -102,6 +102,15 @@ class FullGaussian:
         return jnp.full(self.mean.shape[:1], dimension + dimension * (dimension + 1) // 2)
 
 
+    def padded(self, spare: int) -> FullGaussian:
+        """Return the channel with rows for ``spare`` more states."""
+        cov = estimates.pad_states(self.cov, spare, 0)
+        eye = jnp.eye(cov.shape[-1], dtype=cov.dtype)[None]
+        absent = jnp.arange(cov.shape[0]) >= self.cov.shape[0]
+        return FullGaussian(
+            estimates.pad_states(self.mean, spare, 0), jnp.where(absent[:, None, None], eye, cov)
+        )
+
     def check(self, x: np.ndarray, observed: np.ndarray, name: str) -> None:
         """Refuse observations of another dimension, and numbers that are not finite."""
         check_vectors(x, observed, self.mean.shape[-1], name)
