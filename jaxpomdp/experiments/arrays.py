@@ -31,7 +31,7 @@ def flatten(state: Any) -> dict[str, np.ndarray]:
 
 
 def _is_key(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _plain(leaf: Any) -> Any:
@@ -89,7 +89,7 @@ def save_arrays(file: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str,
         raise ValueError(f"arrays must hold numbers, got Python objects under {unsafe[0]}")
     part = file.with_name(file.name + ".part")
     with open(part, "wb") as handle:
-        np.savez(handle, **{META: np.array(json.dumps(meta))}, **arrays)
+        np.savez(handle, allow_pickle=False, **{META: np.array(json.dumps(meta))}, **arrays)
         handle.flush()
         os.fsync(handle.fileno())
     os.replace(part, file)

@@ -69,8 +69,7 @@ def seed_range(first: int, count: int) -> tuple[int, ...]:
 
 def describe(config: RunConfig, agent: Any) -> dict[str, Any]:
     """Return what fixes the results of a run, as JSON: the run and the agent's whole configuration."""
-    settings: Any = getattr(agent, "config", None)
-    resolved = dataclasses.asdict(settings) if dataclasses.is_dataclass(settings) else {}
+    resolved = dataclasses.asdict(agent.config)
     description = {"format": 1, "run": dataclasses.asdict(config), "agent": resolved}
     return json.loads(json.dumps(description, default=str))
 

@@ -74,7 +74,7 @@ def bootstrap(
     """
     sample = _numbers(values)
     value = float(statistic(sample, axis=-1))
-    if np.ptp(sample) == 0:
+    if np.all(sample == sample[0]):
         return Interval(value, value, value)
     from scipy import stats
 

@@ -1,0 +1,24 @@
+"""Figure 3.5: the hallway with and without noise. The coupled UDHMM is published only, so far."""
+
+from __future__ import annotations
+
+from jaxpomdp.experiments.experiment import Experiment, Row
+from jaxpomdp.experiments.thesis import hallway
+
+TARGETS = {"successes_held": 14}
+"""Section 3.5.1: the coupled UDHMM fails in 7 of 21 runs."""
+
+EXPERIMENT = Experiment(
+    name="fig-3.5",
+    title="Figure 3.5: the hallway, without and with noise",
+    source="thesis, Figure 3.5 and section 3.5.1 (the curves' points are in no public text)",
+    rows=(
+        Row("standard", hallway.run("hallway", 0.2)),
+        Row("noise", hallway.run("hallway-noise", 0.2)),
+        Row("coupled, no noise", None, TARGETS),
+    ),
+    columns=hallway.COLUMNS,
+    plot=hallway.plot,
+    criterion=hallway.CRITERION,
+    notes=hallway.NOTES,
+)
