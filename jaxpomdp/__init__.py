@@ -13,13 +13,137 @@ if TYPE_CHECKING:
     from jaxpomdp._types import Chain as Chain
     from jaxpomdp._types import Posterior as Posterior
     from jaxpomdp._types import TrialBatch as TrialBatch
+    from jaxpomdp.envs.hallway import hallway as hallway
+    from jaxpomdp.envs.hallway import hallway_navigation as hallway_navigation
+    from jaxpomdp.envs.maze89 import heading_maze as heading_maze
+    from jaxpomdp.envs.maze89 import maze57 as maze57
+    from jaxpomdp.envs.maze89 import maze89 as maze89
+    from jaxpomdp.envs.maze89 import tiger_grid as tiger_grid
+    from jaxpomdp.envs.pomdp_file import read_pomdp as read_pomdp
+    from jaxpomdp.envs.pomdp_tables import ParsedPOMDP as ParsedPOMDP
+    from jaxpomdp.envs.pomdp_world import from_pomdp as from_pomdp
+    from jaxpomdp.envs.pomdp_world import to_pomdp as to_pomdp
+    from jaxpomdp.envs.pomdp_write import write_pomdp as write_pomdp
+    from jaxpomdp.envs.pomdpx import read_pomdpx as read_pomdpx
+    from jaxpomdp.envs.registry import make as make
+    from jaxpomdp.envs.tmaze import tmaze as tmaze
+    from jaxpomdp.envs.world import Step as Step
+    from jaxpomdp.envs.world import TrueModel as TrueModel
+    from jaxpomdp.envs.world import World as World
+    from jaxpomdp.envs.world import model_of as model_of
+    from jaxpomdp.envs.world import reset as reset
+    from jaxpomdp.envs.world import reset_key as reset_key
+    from jaxpomdp.envs.world import step as step
+    from jaxpomdp.envs.world import step_key as step_key
+    from jaxpomdp.envs.wrappers import limited as limited
+    from jaxpomdp.envs.wrappers import noisy as noisy
+    from jaxpomdp.kernels.filtering import Filtered as Filtered
+    from jaxpomdp.kernels.filtering import filter_tape as filter_tape
+    from jaxpomdp.kernels.filtering import observe as observe
+    from jaxpomdp.kernels.filtering import predict as predict
+    from jaxpomdp.kernels.filtering import predict_observation as predict_observation
+    from jaxpomdp.kernels.filtering import predict_steps as predict_steps
+    from jaxpomdp.kernels.filtering import update_belief as update_belief
+    from jaxpomdp.kernels.posterior import posterior as posterior
+    from jaxpomdp.kernels.smoothing import smooth as smooth
+    from jaxpomdp.models.data import trial_batch as trial_batch
+    from jaxpomdp.models.em import EMConfig as EMConfig
+    from jaxpomdp.models.em import EMReport as EMReport
+    from jaxpomdp.models.em import e_step as e_step
+    from jaxpomdp.models.em import em_step as em_step
+    from jaxpomdp.models.em import fit as fit
+    from jaxpomdp.models.emission import Categorical as Categorical
+    from jaxpomdp.models.emission import DiagonalGaussian as DiagonalGaussian
+    from jaxpomdp.models.emission import ReturnModel as ReturnModel
+    from jaxpomdp.models.family import Family as Family
+    from jaxpomdp.models.family import Prior as Prior
+    from jaxpomdp.models.flat import FLAT as FLAT
+    from jaxpomdp.models.flat import FlatParams as FlatParams
+    from jaxpomdp.models.full_gaussian import FullGaussian as FullGaussian
+    from jaxpomdp.models.gradient import GradientConfig as GradientConfig
+    from jaxpomdp.models.gradient import fit_gradient as fit_gradient
+    from jaxpomdp.models.init import Real as Real
+    from jaxpomdp.models.init import observation_seeded as observation_seeded
+    from jaxpomdp.models.init import random_params as random_params
+    from jaxpomdp.models.selection import bic as bic
+    from jaxpomdp.models.selection import fit_restarts as fit_restarts
+    from jaxpomdp.models.selection import held_out as held_out
+    from jaxpomdp.models.selection import log_evidence as log_evidence
+    from jaxpomdp.models.store import load as load
+    from jaxpomdp.models.store import save as save
+    from jaxpomdp.packing import pack as pack
+    from jaxpomdp.packing import unpack as unpack
+    from jaxpomdp.structure.spec import FlatSpec as FlatSpec
+    from jaxpomdp.structure.splits import SplitConfig as SplitConfig
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Categorical": "jaxpomdp.models.emission",
     "Chain": "jaxpomdp._types",
+    "DiagonalGaussian": "jaxpomdp.models.emission",
+    "EMConfig": "jaxpomdp.models.em",
+    "EMReport": "jaxpomdp.models.em",
+    "FLAT": "jaxpomdp.models.flat",
+    "Family": "jaxpomdp.models.family",
+    "Filtered": "jaxpomdp.kernels.filtering",
+    "FlatParams": "jaxpomdp.models.flat",
+    "FlatSpec": "jaxpomdp.structure.spec",
+    "FullGaussian": "jaxpomdp.models.full_gaussian",
+    "GradientConfig": "jaxpomdp.models.gradient",
+    "ParsedPOMDP": "jaxpomdp.envs.pomdp_tables",
     "Posterior": "jaxpomdp._types",
+    "Prior": "jaxpomdp.models.family",
+    "Real": "jaxpomdp.models.init",
+    "ReturnModel": "jaxpomdp.models.emission",
+    "SplitConfig": "jaxpomdp.structure.splits",
+    "Step": "jaxpomdp.envs.world",
     "TrialBatch": "jaxpomdp._types",
+    "TrueModel": "jaxpomdp.envs.world",
+    "World": "jaxpomdp.envs.world",
+    "bic": "jaxpomdp.models.selection",
+    "e_step": "jaxpomdp.models.em",
+    "em_step": "jaxpomdp.models.em",
+    "filter_tape": "jaxpomdp.kernels.filtering",
+    "fit": "jaxpomdp.models.em",
+    "fit_gradient": "jaxpomdp.models.gradient",
+    "fit_restarts": "jaxpomdp.models.selection",
+    "from_pomdp": "jaxpomdp.envs.pomdp_world",
+    "hallway": "jaxpomdp.envs.hallway",
+    "hallway_navigation": "jaxpomdp.envs.hallway",
+    "heading_maze": "jaxpomdp.envs.maze89",
+    "held_out": "jaxpomdp.models.selection",
+    "limited": "jaxpomdp.envs.wrappers",
+    "load": "jaxpomdp.models.store",
+    "log_evidence": "jaxpomdp.models.selection",
+    "make": "jaxpomdp.envs.registry",
+    "maze57": "jaxpomdp.envs.maze89",
+    "maze89": "jaxpomdp.envs.maze89",
+    "model_of": "jaxpomdp.envs.world",
+    "noisy": "jaxpomdp.envs.wrappers",
+    "observation_seeded": "jaxpomdp.models.init",
+    "observe": "jaxpomdp.kernels.filtering",
+    "pack": "jaxpomdp.packing",
+    "posterior": "jaxpomdp.kernels.posterior",
+    "predict": "jaxpomdp.kernels.filtering",
+    "predict_observation": "jaxpomdp.kernels.filtering",
+    "predict_steps": "jaxpomdp.kernels.filtering",
+    "random_params": "jaxpomdp.models.init",
+    "read_pomdp": "jaxpomdp.envs.pomdp_file",
+    "read_pomdpx": "jaxpomdp.envs.pomdpx",
+    "reset": "jaxpomdp.envs.world",
+    "reset_key": "jaxpomdp.envs.world",
+    "save": "jaxpomdp.models.store",
+    "smooth": "jaxpomdp.kernels.smoothing",
+    "step": "jaxpomdp.envs.world",
+    "step_key": "jaxpomdp.envs.world",
+    "tiger_grid": "jaxpomdp.envs.maze89",
+    "tmaze": "jaxpomdp.envs.tmaze",
+    "to_pomdp": "jaxpomdp.envs.pomdp_world",
+    "trial_batch": "jaxpomdp.models.data",
+    "unpack": "jaxpomdp.packing",
+    "update_belief": "jaxpomdp.kernels.filtering",
+    "write_pomdp": "jaxpomdp.envs.pomdp_write",
 }
 _ROOMS = ("agents", "cli", "envs", "experiments", "kernels", "models", "numerics", "packing", "structure")
 
