@@ -6,18 +6,21 @@ import time
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxpomdp import numerics
+from jaxpomdp._types import TrialBatch
+from jaxpomdp.kernels.filtering import filter_tape
+from jaxpomdp.models.flat import FLAT, FlatParams
 from jaxpomdp.packing import carry, pack, slots_of, unpack, unpack_all
 from jaxpomdp.structure import spec as spec_module
 from jaxpomdp.structure.edits import Shares, clone_state
 from jaxpomdp.structure.spec import Channel, FlatSpec
 from tests.structure.worlds import random_spec as any_random_spec
-
 
 random_spec = partial(any_random_spec, dtype=np.float32)
 
@@ -102,11 +105,59 @@ def test_errors_name_what_is_wrong() -> None:
 def test_a_phase_of_21_models_of_70_states_packs_in_milliseconds() -> None:
     specs = [random_spec(s, 70, a=5) for s in range(21)]
     params = pack(specs, 72)
-    begun = time.perf_counter()
-    for _ in range(3):
-        params = pack(unpack_all(params), 72)
-    jax.block_until_ready(params)
-    assert (time.perf_counter() - begun) / 3 < 0.25
+    seconds = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        jax.block_until_ready(pack(unpack_all(params), 72))
+        seconds.append(time.perf_counter() - begun)
+    assert min(seconds) < 0.15
+
+
+def evidence_under(params: FlatParams, theta: float = 0.3) -> np.ndarray:
+    """Return the log-evidence ``[S]`` of one made-up trial, returns included."""
+    rng = np.random.default_rng(0)
+    seen = np.ones(25, bool)
+    batch = TrialBatch(
+        observations=(rng.integers(0, 3, 25), rng.normal(size=(25, 2)).astype(np.float32)),
+        actions=rng.integers(0, 2, 25),
+        rewards=np.zeros(25, np.float32),
+        returns=rng.normal(size=25).astype(np.float32),
+        valid=seen,
+        start=np.arange(25) == 0,
+        terminated=np.arange(25) == 24,
+        observed=seen,
+        has_return=seen,
+    )
+
+    def one(model: FlatParams) -> jax.Array:
+        chain, log_obs = FLAT.learning(model, jax.tree.map(jnp.asarray, batch), theta)
+        return filter_tape(chain, log_obs, batch.actions, batch.start, batch.valid).log_norm.sum()
+
+    return np.asarray(jax.jit(jax.vmap(one))(params))
+
+
+def permuted(spec: FlatSpec, order: np.ndarray) -> FlatSpec:
+    channels = tuple(channel.take(order) for channel in spec.emissions)
+    log_trans = spec.log_trans[:, order][:, :, order]
+    return FlatSpec(
+        spec.log_init[order], log_trans, channels, spec.return_mean[order], spec.return_var[order]
+    )
+
+
+def test_results_do_not_depend_on_capacity_or_order() -> None:
+    specs = [random_spec(0, 4, per_action=True), random_spec(1, 6, per_action=True)]
+    tight, roomy = evidence_under(pack(specs, 6)), evidence_under(pack(specs, 11))
+    shuffled = [permuted(spec, np.random.default_rng(2).permutation(spec.num_states)) for spec in specs]
+    np.testing.assert_allclose(roomy, tight, rtol=1e-6)
+    np.testing.assert_allclose(evidence_under(pack(shuffled, 11)), tight, rtol=1e-5)
+    assert not np.allclose(evidence_under(pack(specs[::-1], 6)), tight, rtol=1e-3)
+
+
+def test_a_split_leaves_the_evidence_of_observations_on_the_device() -> None:
+    spec, shares = random_spec(3, 4), np.array([0.3, 0.7])
+    clone = clone_state(spec, 2, Shares(shares, np.tile(shares, (1, 4, 1)), np.tile(np.eye(2), (1, 1, 1))))
+    before, after = evidence_under(pack([spec, spec], 5), 0.0), evidence_under(pack([clone, spec], 5), 0.0)
+    np.testing.assert_allclose(after, before, rtol=1e-5)
 
 
 def test_slots_are_empty_for_no_models() -> None:

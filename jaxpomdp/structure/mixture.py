@@ -174,9 +174,9 @@ def _check(
 
 def _floor(values: np.ndarray, share: np.ndarray, floor: float) -> float:
     """Keep every component wider than rounding, so that no density is infinite."""
-    mean = values @ share
-    spread = (values - mean) ** 2 @ share
-    return max(floor, 1e-9 * spread, 1e-12 * mean**2, np.finfo(float).tiny)
+    mean = float(values @ share)
+    spread = float((values - mean) ** 2 @ share)
+    return max(floor, 1e-9 * spread, 1e-12 * mean**2, float(np.finfo(float).tiny))
 
 
 def _quantile_centres(values: np.ndarray, share: np.ndarray, components: int) -> np.ndarray:

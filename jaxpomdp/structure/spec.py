@@ -145,15 +145,11 @@ class FlatSpec:
             ValueError: shapes disagree, or the numbers are not probabilities.
         """
         start = frozen("init", init)
-        mean = np.zeros((len(start), 1), start.dtype) if return_mean is None else return_mean
-        var = np.ones(np.shape(mean), start.dtype) if return_var is None else return_var
-        spec = FlatSpec(
-            safe_log(start),
-            safe_log(frozen("trans", trans)),
-            tuple(c if isinstance(c, Channel) else _table(c) for c in emissions),
-            frozen("return_mean", mean),
-            frozen("return_var", var),
-        )
+        none = np.zeros((len(start), 1), start.dtype)
+        mean = frozen("return_mean", none if return_mean is None else return_mean)
+        var = frozen("return_var", np.ones_like(mean) if return_var is None else return_var)
+        channels = tuple(c if isinstance(c, Channel) else _table(c) for c in emissions)
+        spec = FlatSpec(safe_log(start), safe_log(frozen("trans", trans)), channels, mean, var)
         validate(spec)
         return spec
 
