@@ -76,4 +76,5 @@ def _of_file(path: str, settings: dict[str, Any]) -> World:
     from jaxpomdp.envs.pomdpx import read_pomdpx
 
     read = read_pomdpx if path.lower().endswith("x") else read_pomdp
-    return from_pomdp(read(Path(path)), **{"goal_states": "reset", "name": Path(path).stem} | settings)
+    usual: dict[str, Any] = {"goal_states": "reset", "name": Path(path).stem}
+    return from_pomdp(read(Path(path)), **(usual | settings))

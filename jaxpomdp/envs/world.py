@@ -186,7 +186,7 @@ def model_of(world: World) -> TrueModel:
     """
     successors, prob = np.asarray(world.successors), np.asarray(world.transition_prob)
     trans = np.zeros((world.num_actions, world.num_states, world.num_states), prob.dtype)
-    a, s, _ = np.indices(successors.shape, sparse=True)
+    a, s = np.arange(world.num_actions)[:, None, None], np.arange(world.num_states)[None, :, None]
     np.add.at(trans, (a, s, successors), prob)
     reward = np.sum(prob * np.asarray(world.reward), axis=-1)
     return TrueModel(
