@@ -14,7 +14,11 @@ from jaxpomdp.structure.splits import STATE_SPLIT, SplitConfig
 
 @dataclass(frozen=True)
 class PolicyConfig:
-    """How much the structure may change."""
+    """How much the structure may change.
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
 
     node_cap: int = 70
     """states at most"""
@@ -26,6 +30,13 @@ class PolicyConfig:
     """phases before this one edit nothing"""
     cool_down: int = 0
     """phases for which a state that was edited (and its copies) is left alone"""
+
+    def __post_init__(self) -> None:
+        """Refuse settings out of range."""
+        least = {"node_cap": 1, "edits_per_phase": 0, "every": 1, "first_phase": 0, "cool_down": 0}
+        for name, number in least.items():
+            if getattr(self, name) < number:
+                raise ValueError(f"{name} must be at least {number}, got {getattr(self, name)}")
 
 
 STATE_SPLITS = ((STATE_SPLIT, SplitConfig()),)

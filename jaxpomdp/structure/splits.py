@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -27,10 +27,22 @@ from jaxpomdp.structure.spec import FlatSpec
 
 KIND = "state"
 
+_CHOICES = {
+    "correction": get_args(Correction),
+    "count": ("weight", "effective"),
+    "rank": ("statistic", "effect", "likelihood", "spread"),
+    "shares": ("even", "weights"),
+    "other_actions": ("copy", "shift"),
+}
+
 
 @dataclass(frozen=True)
 class SplitConfig:
-    """When a state is split and how its probabilities are shared (the thesis leaves all of it open)."""
+    """When a state is split and how its probabilities are shared (the thesis leaves all of it open).
+
+    Raises:
+        ValueError: a setting is out of its range.
+    """
 
     significance: float = 0.01
     """split where the corrected p-value of the test of normality is below this"""
@@ -60,11 +72,31 @@ class SplitConfig:
     """how incoming probability is shared among copies: evenly (the thesis), or as the mixture's weights"""
     stay: float | None = None
     """share of a self-transition that a copy keeps to itself (sticky: 0.9); None: shared like the rest"""
-    jitter: float = 0.1
+    jitter: float = 0.5
     """log-scale of random differences between the shares of different predecessors, so that Baum-Welch can
     tell copies apart where theta is zero; drawn only where a source of random numbers is given"""
     other_actions: Literal["copy", "shift"] = "shift"
     """returns of actions the split was not found for: kept, or moved by as much as the component's mean"""
+
+    def __post_init__(self) -> None:
+        """Refuse settings out of range."""
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        for name in ("significance", "fit_significance", "minimum_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if self.stay is not None and not 0 <= self.stay <= 1:
+            raise ValueError(f"stay must be None or between 0 and 1, got {self.stay}")
+        for name in ("minimum_weight", "minimum_effect", "minimum_spread", "variance_floor", "jitter"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
+        if self.cells < 4:
+            raise ValueError(
+                f"cells must be at least 4 (a fitted Gaussian leaves cells - 3), got {self.cells}"
+            )
+        if not self.components or min(self.components) < 2:
+            raise ValueError(f"components must be sizes of 2 or more, got {self.components}")
 
 
 class StateSplit(NamedTuple):

@@ -87,3 +87,9 @@ def test_the_same_seed_gives_the_same_model() -> None:
 def test_rest_of_another_length_is_named() -> None:
     with pytest.raises(ValueError, match=r"rest must have shape \(2,\), got \(3,\)"):
         revise(random_spec(0, 2), evidence_of(lumpy(2)), phase=0, rest=np.zeros(3, int))
+
+
+@pytest.mark.parametrize("name", ["node_cap", "edits_per_phase", "every", "first_phase", "cool_down"])
+def test_settings_out_of_range_are_named(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be at least"):
+        PolicyConfig(**{name: -1})

@@ -263,3 +263,20 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(ValueError, match=r"kind 'state' for 3 states, got 'state' for 4"):
         apply_split(spec, an_edit(0, 4, 2))
     assert isinstance(apply_split(spec, an_edit(0, 4, 2).moved(3)), FlatSpec)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"correction": "fisher"}, "correction must be one of none, bonferroni, holm.*got 'fisher'"),
+        ({"rank": "luck"}, "rank must be one of statistic"),
+        ({"significance": 2.0}, "significance must be between 0 and 1, got 2.0"),
+        ({"stay": -0.1}, "stay must be None or between 0 and 1"),
+        ({"jitter": float("nan")}, "jitter must be at least 0, got nan"),
+        ({"cells": 3}, "cells must be at least 4"),
+        ({"components": (1, 2)}, "components must be sizes of 2 or more"),
+    ],
+)
+def test_settings_out_of_range_are_named(setting: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SplitConfig(**setting)
