@@ -6,15 +6,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
-from jaxpomdp.experiments.config import EVALUATION_SEED, RunConfig, describe
+from jaxpomdp.experiments.config import EVALUATION_SEED, RunConfig, describe, did_you_mean
 from jaxpomdp.experiments.progress import Progress
 from jaxpomdp.experiments.record import RunDirectory, changed_versions, open_run
 from jaxpomdp.experiments.results import evaluation_rows, score, trial_rows
+
+if TYPE_CHECKING:
+    from jaxpomdp.envs.world import World
 
 Build = Callable[[RunConfig], tuple[Any, Any]]
 SAVE_SECONDS = 15.0
@@ -22,20 +25,19 @@ RECENT_TRIALS = 100
 FINAL = 1 << 30
 
 
-def load_world(name: str) -> Any:
-    """Return the world of a name, or of a .POMDP file.
+def load_world(name: str) -> World:
+    """Return the world of a name, or of a .POMDP or .pomdpx file.
 
     Raises:
         ValueError: the name is unknown, or the file is refused.
+        FileNotFoundError: there is no such file.
     """
-    if name.lower().endswith(".pomdp"):
-        from jaxpomdp.envs.pomdp_file import read_pomdp
-        from jaxpomdp.envs.pomdp_world import from_pomdp
+    from jaxpomdp.envs import registry
 
-        return from_pomdp(read_pomdp(name))
-    from jaxpomdp.envs.registry import make
-
-    return make(name)
+    try:
+        return registry.make(name)
+    except ValueError as error:
+        raise ValueError(f"env: {error}{did_you_mean(name, registry.names())}") from None
 
 
 def build(config: RunConfig) -> tuple[Any, Any]:

@@ -5,10 +5,10 @@ To add one, put a file here that defines ``EXPERIMENT``; its command is ``jaxpom
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import pkgutil
 
+from jaxpomdp.experiments.config import did_you_mean
 from jaxpomdp.experiments.experiment import Experiment
 
 
@@ -27,7 +27,6 @@ def find(name: str) -> Experiment:
     """
     known = experiments()
     if name not in known:
-        close = difflib.get_close_matches(name, known, 1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
+        hint = did_you_mean(name, known)
         raise ValueError(f"name must be one of {', '.join(known)} or all, got {name!r}{hint}")
     return known[name]
