@@ -24,6 +24,8 @@ def spread(weight: np.ndarray, iterations: int = 300, apart: float = 0.0) -> np.
         >>> np.abs(spread(chain)[:, 0]).round(2).tolist()
         [1.0, 0.0, 1.0]
     """
+    if len(weight) < 2:
+        return np.zeros((len(weight), 2))
     distance = _distances(weight)
     place = _classical(distance)
     pull = 1 / np.maximum(distance, 1e-9) ** 2
@@ -35,14 +37,14 @@ def spread(weight: np.ndarray, iterations: int = 300, apart: float = 0.0) -> np.
 
 
 def _distances(weight: np.ndarray) -> np.ndarray:
-    """Return shortest-path lengths; what nothing joins is a little farther than the farthest others."""
+    """Return shortest-path lengths; what nothing joins is a step farther than the farthest others."""
     from scipy.sparse.csgraph import shortest_path
 
     joined = np.maximum(weight, weight.T)
     length = np.where(joined > 1e-3, 1 - np.log(np.clip(joined, 1e-3, 1)), np.inf)
     distance = shortest_path(length, directed=False)
     finite = distance[np.isfinite(distance)]
-    return np.where(np.isfinite(distance), distance, 1.05 * finite.max())
+    return np.where(np.isfinite(distance), distance, finite.max() + 1)
 
 
 def _classical(distance: np.ndarray) -> np.ndarray:

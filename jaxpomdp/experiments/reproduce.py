@@ -19,6 +19,7 @@ from jaxpomdp.experiments.stats import Interval, format_interval
 from jaxpomdp.experiments.sweep import Job, plan, run_jobs
 
 STEP_LIMIT = 251
+DIGITS = {"mean_discounted": 3, "trials_to_hold": 0, "successes_held": 0, "successes_ever": 0}
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ def _sized(config: RunConfig, effort: Effort) -> RunConfig:
     seeds = seed_range(effort.first_seed, 2 if effort.quick else effort.seeds)
     config = replace(config, seeds=seeds)
     if effort.trials is not None and config.trials:
-        config = replace(config, trials=effort.trials)
+        every = min(config.evaluate_every, max(effort.trials // 2, 1))
+        config = replace(config, trials=effort.trials, evaluate_every=every)
     if not effort.quick:
         return config
     trials = min(config.trials, effort.trials or 20)
@@ -204,8 +206,7 @@ def _cell(name: str, found: Mapping[str, float | None] | None) -> str:
         return f">{STEP_LIMIT}"
     if math.isinf(ends[0]):
         return "never"
-    digits = 3 if name == "mean_discounted" else 1
-    return format_interval(Interval(*ends), digits)
+    return format_interval(Interval(*ends), DIGITS.get(name, 1))
 
 
 def _settings_table(settings: Mapping[str, Any]) -> str:

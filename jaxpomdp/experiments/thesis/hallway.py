@@ -16,7 +16,7 @@ CRITERION = Criterion("mean_steps", 7.0, "below", last=2)
 """Consistently under 7.0 steps on average (section 3.5.1)."""
 WINDOW = 10
 COLUMNS = {
-    "successes_held": "runs held under 7.0, of 21",
+    "successes_held": "runs held under 7.0",
     "successes_ever": "runs ever under 7.0",
     "trials_to_hold": "trials until held, median",
     "mean_steps": "steps in the end, mean of seeds",
