@@ -50,13 +50,15 @@ class Train:
     """Settings of the agent, name=value ...; a wrong name is answered with all of them."""
     progress: Progress = "auto"
     """A bar on a terminal and lines elsewhere, always lines, or nothing."""
+    track: bool = False
+    """Write events for TensorBoard into the run directory."""
 
     def run(self) -> None:
         """Train, and print how the agents ended."""
         from jaxpomdp.experiments import runner
         from jaxpomdp.experiments.report import run_report
 
-        runner.run(self.config(), self.out, progress=self.progress)
+        runner.run(self.config(), self.out, progress=self.progress, track=self.track)
         print(run_report(self.out))
 
     def config(self) -> RunConfig:

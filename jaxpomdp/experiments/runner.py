@@ -15,6 +15,7 @@ from jaxpomdp.experiments.config import EVALUATION_SEED, RunConfig, describe, di
 from jaxpomdp.experiments.progress import Progress
 from jaxpomdp.experiments.record import RunDirectory, changed_versions, open_run
 from jaxpomdp.experiments.results import evaluation_rows, score, trial_rows
+from jaxpomdp.experiments.track import Tracker
 
 if TYPE_CHECKING:
     from jaxpomdp.envs.world import World
@@ -59,6 +60,7 @@ def run(
     make: Build = build,
     progress: str = "auto",
     save_seconds: float = SAVE_SECONDS,
+    track: bool = False,
 ) -> Path:
     """Do a run, or the rest of it, in ``path``; a finished run is left as it is.
 
@@ -68,6 +70,7 @@ def run(
         make: gives world and agent of a configuration.
         progress: ``"auto"``, ``"lines"`` or ``"none"``.
         save_seconds: time between commits; a kill loses what was done since the last one.
+        track: write events for TensorBoard under ``path/events``.
 
     Returns:
         ``path``.
@@ -76,12 +79,14 @@ def run(
         RunDirectoryError: the directory holds another run, is damaged, or is in use.
     """
     _, agent = make(config)
-    bar = Progress(path.name, config.trials, progress)
+    settings = (f"{name}={value}" for name, value in config.settings)
+    bar = Progress(" ".join([config.env, config.agent, *settings]), config.trials, progress)
     with open_run(path, describe(config, agent)) as record, bar:
         if (path / "summary.json").exists():
             bar.say(f"{path} is complete")
         else:
-            _Session(config, agent, record, bar, save_seconds).complete()
+            tracker = Tracker(path / "events" if track else None)
+            _Session(config, agent, record, bar, tracker, save_seconds).complete()
     return path
 
 
@@ -89,10 +94,16 @@ class _Session:
     """A run in one process: the agent's state, how far it is, and the rows since the last commit."""
 
     def __init__(
-        self, config: RunConfig, agent: Any, record: RunDirectory, bar: Progress, save_seconds: float
+        self,
+        config: RunConfig,
+        agent: Any,
+        record: RunDirectory,
+        bar: Progress,
+        tracker: Tracker,
+        save_seconds: float,
     ) -> None:
         self.config, self.agent, self.record = config, agent, record
-        self.bar, self.save_seconds = bar, save_seconds
+        self.bar, self.tracker, self.save_seconds = bar, tracker, save_seconds
         self.pending: dict[str, list] = {}
         self.recent: deque = deque(maxlen=RECENT_TRIALS)
         fresh = agent.init(np.asarray(config.seeds))
@@ -117,6 +128,7 @@ class _Session:
             self._phase()
         self._commit()
         self._finish()
+        self.tracker.close()
 
     def _phase(self) -> None:
         before = self.trial
@@ -129,6 +141,7 @@ class _Session:
         self._note(before, trials, phase)
         if judged is not None:
             self._add("evaluations", evaluation_rows(self.config.seeds, after, judged))
+            self.tracker.write("greedy", after, score(judged))
             self.greedy = f"; greedy {np.median(score(judged)['goal_percent']):.0f} %"
         self.bar.update(min(after, self.config.trials), self._live())
         if time.monotonic() - self.saved >= self.save_seconds:
@@ -139,6 +152,7 @@ class _Session:
         return {name: np.asarray(x) for name, x in self.agent.evaluate(state, count, key).items()}
 
     def _note(self, before: int, trials: Mapping[str, np.ndarray], phase: Mapping[str, np.ndarray]) -> None:
+        self.tracker.write("training", self.trial, {**trials, **phase})
         self.recent.extend(np.asarray(trials["success"]).T)
         self._add("trials", trial_rows(self.config.seeds, before, trials))
         states, evidence = (phase.get(name) for name in ("states_alive", "log_evidence"))

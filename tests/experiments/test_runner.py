@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -143,6 +146,25 @@ def test_seed_ranges_and_chunks_are_checked():
         in_chunks(CONFIG, -1)
     with pytest.raises(ValueError, match="workers must be at least 1"):
         run_jobs([], workers=0)
+
+
+def test_tracking_writes_means_over_seeds(tmp_path, monkeypatch):
+    written = []
+    writer = SimpleNamespace(
+        add_scalar=lambda *row: written.append(row), close=lambda: written.append("closed")
+    )
+    monkeypatch.setitem(sys.modules, "tensorboardX", SimpleNamespace(SummaryWriter=lambda path: writer))
+    data = load_run(run(tmp_path, track=True))
+    assert written[-1] == "closed"
+    first = next(row for row in written if row[0] == "training/steps")
+    assert first[1:] == (data.trials["steps"][:, :5].mean(), 5)
+    assert sum(row[0] == "greedy/goal_percent" for row in written) == 2
+
+
+def test_tracking_without_the_library_is_answered_with_how_to_get_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(ModuleNotFoundError, match=r"jaxpomdp\[track\]"):
+        run(tmp_path, track=True)
 
 
 def test_success_is_ever_or_held_and_dated():
