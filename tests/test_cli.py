@@ -160,13 +160,16 @@ def play(monkeypatch, text, *words):
 
 
 def test_play_keeps_score_and_shows_only_observations(tmp_path, capsys, monkeypatch):
-    moves = "e\nwhat\n1\nn\n"
+    moves = "e\nwhat\n1\nn\ns\ne\ne\ns\nn\nq\n"
     assert play(monkeypatch, moves, "--env", "tmaze-1", "--seed", 2, "--out", tmp_path / "played.csv") == 0
     said = capsys.readouterr().out
-    assert "signal" in said
     assert "no such action: north, east, south, west?" in said
-    table = read_table(tmp_path / "played.csv") if (tmp_path / "played.csv").exists() else {"steps": []}
-    assert len(table["steps"]) == said.count("trial:")
+    table = read_table(tmp_path / "played.csv")
+    assert f"{len(table['steps'])} trial" in said
+    assert table["steps"].min() >= 3
+    assert set(table["success"]) <= {0, 1}
+    signals = said.count("signal up >") + said.count("signal down >")
+    assert signals >= len(table["steps"])
 
 
 def test_play_is_the_same_game_for_the_same_seed(capsys, monkeypatch):
