@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxpomdp._types import Array, TrialBatch
 from jaxpomdp.models.em import EMConfig, EMReport, as_models, e_step, em_fit
 from jaxpomdp.models.family import Family
+from jaxpomdp.models.init import stack_models
 
 
 def log_evidence(
@@ -104,8 +105,8 @@ def fit_restarts(
     if restarts < 1:
         raise ValueError(f"restarts must be at least 1, got {restarts}")
     config = EMConfig() if config is None else config
-    keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(restarts))
-    params, batch, _ = as_models(jax.vmap(initialise)(keys), batch)
+    starts = [initialise(jax.random.fold_in(key, i)) for i in range(restarts)]
+    params, batch, _ = as_models(stack_models(starts), batch)
     family.check(params, batch)
     fitted, report = em_fit(family, params, batch, config)
     best = jnp.argmax(report.trace[:, -1])

@@ -84,7 +84,7 @@ def load(path: str | Path) -> Stored:
     if not path.exists():
         raise FileNotFoundError(f"path must be a file written by save, got {path}, which does not exist")
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except (zipfile.BadZipFile, ValueError, OSError, EOFError, AttributeError) as error:
         raise ValueError(f"{path} must be a NumPy archive of plain arrays, got {error}") from None
