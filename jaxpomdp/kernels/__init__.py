@@ -1,1 +1,1 @@
-"""Kernels: pure functions of arrays for one unbatched sequence; lift them with ``jax.vmap`` at the call site."""
+"""Kernels: pure functions of arrays for one unbatched sequence; lift them with ``jax.vmap``."""

@@ -1,20 +1,24 @@
 """Evaluation plans: the posterior of many models on many tapes, with one result whichever plan runs.
 
-``scan`` is the definition: ``smooth`` under two maps. The other plans carry the whole batch through time at
-once, so that each step is a few large matrix products.
+- ``scan`` is the definition: ``smooth`` under two maps.
+- ``grouped`` carries the whole batch through time at once (``grouped``), for any device and dtype.
+- ``native`` is the loop in C++ (``native``), on CPU in float32 where it could be built.
+- ``auto`` takes ``native`` where it can and ``grouped`` elsewhere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxpomdp._types import Array, Chain, Posterior
+from jaxpomdp.kernels import native
+from jaxpomdp.kernels.grouped import smooth_grouped
 from jaxpomdp.kernels.smoothing import smooth
-
-PLANS = ("auto", "scan")
 
 
 def _scan_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
@@ -24,27 +28,108 @@ def _scan_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, vali
     return each._replace(xi=jnp.sum(each.xi, axis=1), initial=jnp.sum(each.initial, axis=1))
 
 
+def _grouped_plan(chains: Chain, *tapes: Array) -> Posterior:
+    """Smooth in groups; models with a tape that underflowed are done again, tape by tape, by ``smooth``."""
+    scaled, trusted = smooth_grouped(chains, *tapes)
+    return _repair(scaled, ~jnp.all(trusted, axis=1), chains, *tapes)
+
+
+def _repair(result: Posterior, spoilt: Array, chains: Chain, *tapes: Array) -> Posterior:
+    """Replace the results of the models that are ``spoilt[S]``; a loop that runs no turn when none is."""
+    per_model = result.log_evidence.shape[1]
+    todo = jnp.repeat(spoilt, per_model)
+    order = jnp.argsort(~todo, stable=True)
+    clean = result._replace(
+        xi=jnp.where(spoilt[:, None, None, None], 0, result.xi),
+        initial=jnp.where(spoilt[:, None], 0, result.initial),
+    )
+
+    def redo(carry: tuple[Array, Posterior]) -> tuple[Array, Posterior]:
+        turn, total = carry
+        model, tape = jnp.divmod(order[turn], per_model)
+        one = smooth(jax.tree.map(lambda x: x[model], chains), *(x[model, tape] for x in tapes))
+        return turn + 1, Posterior(
+            total.log_evidence.at[model, tape].set(one.log_evidence),
+            total.gamma.at[model, tape].set(one.gamma),
+            total.xi.at[model].add(one.xi),
+            total.initial.at[model].add(one.initial),
+        )
+
+    return lax.while_loop(lambda carry: carry[0] < jnp.sum(todo), redo, (jnp.sum(todo) * 0, clean))[1]
+
+
+def _native_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
+    """Hand the batch to the C++ loop."""
+    tapes = (log_obs, actions.astype(jnp.int32), start, valid)
+    return native.estep(jnp.exp(chains.log_init), jnp.exp(chains.log_trans), *tapes)
+
+
+_PLANS: dict[str, Callable[..., Posterior]] = {
+    "scan": _scan_plan,
+    "grouped": _grouped_plan,
+    "native": _native_plan,
+}
+
+PLANS = ("auto", *_PLANS)
+"""Names of the evaluation plans."""
+
+
+def choose_plan(plan: str, dtype: jnp.dtype) -> str:
+    """Resolve ``auto``, and check that a named plan can run here.
+
+    Raises:
+        ValueError: ``plan`` is not known, or is ``native`` where that cannot run.
+    """
+    if plan not in PLANS:
+        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
+    fits = plan in ("auto", "native") and dtype == jnp.float32 and native.available()
+    if plan == "native" and not fits:
+        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
+    if plan == "auto":
+        return "native" if fits else "grouped"
+    return plan
+
+
 @partial(jax.jit, static_argnames="plan")
+def _posterior(chains: Chain, *tapes: Array, plan: str) -> Posterior:
+    return _PLANS[plan](chains, *tapes)
+
+
 def posterior(
     chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array, *, plan: str = "auto"
 ) -> Posterior:
-    """Smooth ``B`` tapes under each of ``S`` models.
+    """Smooth ``B`` tapes under each of ``S`` models; what ``smoothing.smooth`` does, for many.
 
     Args:
         chains: ``log_init[S, N]``, ``log_trans[S, A, N, N]``.
-        log_obs: ``[S, B, T, N]``.
+        log_obs: ``[S, B, T, N]``; a missing step is a row of zeros.
         actions: int ``[S, B, T]``.
         start: bool ``[S, B, T]``.
         valid: bool ``[S, B, T]``.
-        plan: one of ``PLANS``.
+        plan: one of ``PLANS``; all give the same up to rounding.
 
     Returns:
         ``log_evidence[S, B]``, ``gamma[S, B, T, N]``, ``xi[S, A, N, N]``, ``initial[S, N]``; the last two are
         sums over the tapes.
 
     Raises:
-        ValueError: ``plan`` is not known.
+        ValueError: ``plan`` is not known or cannot run here, or the shapes do not fit.
     """
-    if plan not in PLANS:
-        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    return _scan_plan(chains, log_obs, actions, start, valid)
+    _check_shapes(chains, log_obs, actions, start, valid)
+    return _posterior(chains, log_obs, actions, start, valid, plan=choose_plan(plan, log_obs.dtype))
+
+
+def _check_shapes(chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> None:
+    """Raise if the leading axes disagree, naming the argument."""
+    if log_obs.ndim != 4:
+        raise ValueError(f"log_obs must have shape [S, B, T, N], got {log_obs.shape}")
+    models, _, _, states = log_obs.shape
+    wanted = {"actions": actions, "start": start, "valid": valid}
+    for name, array in wanted.items():
+        if array.shape != log_obs.shape[:3]:
+            raise ValueError(f"{name} must have shape {log_obs.shape[:3]} as log_obs, got {array.shape}")
+    if chains.log_init.shape != (models, states):
+        raise ValueError(f"log_init must have shape {(models, states)}, got {chains.log_init.shape}")
+    got = chains.log_trans.shape
+    if len(got) != 4 or (got[0], *got[2:]) != (models, states, states):
+        raise ValueError(f"log_trans must have shape [{models}, A, {states}, {states}], got {got}")

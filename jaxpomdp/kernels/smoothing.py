@@ -1,10 +1,10 @@
 """The backward pass and expected counts: what a whole tape says about each of its steps.
 
-Two routes to one ``Posterior``. ``smooth_scaled`` carries probabilities, renormalised at every step: fast, and
-accurate unless a probability that mattered fell below the smallest float. It can tell: then, at some step, the
-overlap of what the past and the future allow is itself tiny (``OVERLAP_FLOOR``). ``smooth_exact`` carries
-logarithms and takes a log-sum-exp over all pairs of states. ``smooth`` is the first, rescued by the second
-only when needed.
+Two routes to one ``Posterior``. ``smooth_scaled`` carries probabilities, renormalised at every step: fast,
+and accurate unless a probability that mattered fell below the smallest float. It can tell: then the overlap
+of what the past and the future allow is itself tiny at some step (``overlap_floor``). ``smooth_exact``
+carries logarithms and takes a log-sum-exp over all pairs of states. ``smooth`` is the first, rescued by the
+second only when needed.
 
 Source: Rabiner (1989); thesis section 3.3. The overlap test is ours: everything lost to underflow is at most
 ``N`` times the smallest float at a step, so it changes a step whose overlap is above the floor by less than
@@ -27,20 +27,22 @@ def overlap_floor(dtype: jnp.dtype) -> float:
 
 
 def relative_likelihood(log_obs: Array, valid: Array) -> Array:
-    """Return ``exp(log_obs - max log_obs)`` over the last axis: at most one; ones at padding and impossible steps."""
+    """Return ``exp(log_obs - max log_obs)`` over the last axis: at most one; all ones at padding."""
     floored = jnp.maximum(log_obs, NEG)
     weight = jnp.exp(floored - jnp.max(floored, axis=-1, keepdims=True))
     return jnp.where(valid[..., None], weight, 1)
 
 
 def backward_weights(trans: Array, weight: Array, actions: Array, linked: Array) -> Array:
-    """Run backward: ``future_t(i) ∝ weight_t(i) sum_j trans(a_t, i, j) future_{t+1}(j)``, the sum's largest entry one.
+    """Run backward: ``future_t = weight_t beta_t``, ``beta_t(i) ∝ sum_j trans(a_t, i, j) future_{t+1}(j)``.
+
+    ``beta`` is scaled so that its largest entry is one.
 
     Args:
         trans: probabilities ``[A, N, N]``.
         weight: relative likelihoods ``[T, N]``.
         actions: int ``[T]``.
-        linked: bool ``[T]``, the step leads to the next; else the sum is one.
+        linked: bool ``[T]``, the step leads to the next; else ``beta`` is one.
 
     Returns:
         ``future[T, N]``, in proportion to the probability of this and all later observations of the trial.
@@ -57,9 +59,9 @@ def backward_weights(trans: Array, weight: Array, actions: Array, linked: Array)
 
 
 def transition_counts(trans: Array, belief: Array, arriving: Array, actions: Array, linked: Array) -> Array:
-    """Return expected transitions ``xi(a) = trans(a) * sum_t [a_t = a] belief_t arriving_{t+1}^T``, ``[A, N, N]``.
+    """Return expected transitions, ``[A, N, N]``: one matrix product per action, nothing of size ``T N^2``.
 
-    One matrix product per action; nothing of size ``T N^2``.
+    ``xi(a, i, j) = trans(a, i, j) sum_t [a_t = a] belief_t(i) arriving_{t+1}(j)``.
 
     Args:
         trans: probabilities ``[A, N, N]``.
@@ -123,8 +125,8 @@ def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
     _, (belief, predicted, log_norm) = lax.scan(
         step, chain.log_init, (rows, actions, trial_starts(start, valid))
     )
-    here = valid[:, None]
-    return Filtered(jnp.where(here, belief, NEG), jnp.where(here, predicted, NEG), jnp.where(valid, log_norm, 0))
+    belief, predicted = (jnp.where(valid[:, None], x, NEG) for x in (belief, predicted))
+    return Filtered(belief, predicted, jnp.where(valid, log_norm, 0))
 
 
 def _backward_exact(log_trans: Array, log_obs: Array, actions: Array, linked: Array) -> Array:
