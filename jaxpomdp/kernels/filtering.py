@@ -49,7 +49,7 @@ def observe(predicted: Array, log_obs: Array) -> tuple[Array, Array]:
 
     Example:
         >>> belief, log_norm = observe(jnp.array([0.5, 0.5]), jnp.log(jnp.array([0.9, 0.1])))
-        >>> print(belief, round(float(jnp.exp(log_norm)), 6))
+        >>> print(belief.round(3), jnp.exp(log_norm).round(3))
         [0.9 0.1] 0.5
     """
     log_joint = safe_log(predicted) + log_obs
