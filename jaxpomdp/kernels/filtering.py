@@ -49,8 +49,8 @@ def observe(predicted: Array, log_obs: Array) -> tuple[Array, Array]:
 
     Example:
         >>> belief, log_norm = observe(jnp.array([0.5, 0.5]), jnp.log(jnp.array([0.9, 0.1])))
-        >>> print(belief.round(3), jnp.exp(log_norm).round(3))
-        [0.9 0.1] 0.5
+        >>> [round(float(p), 3) for p in belief], round(float(jnp.exp(log_norm)), 3)
+        ([0.9, 0.1], 0.5)
     """
     log_joint = safe_log(predicted) + log_obs
     log_norm = log_sum_exp(log_joint)
