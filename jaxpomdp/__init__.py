@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from jaxpomdp._types import Chain as Chain
     from jaxpomdp._types import Posterior as Posterior
     from jaxpomdp._types import TrialBatch as TrialBatch
+    from jaxpomdp.agents.planners import PlannerConfig as PlannerConfig
+    from jaxpomdp.agents.planners import Policy as Policy
+    from jaxpomdp.agents.planners import evaluate_policy as evaluate_policy
+    from jaxpomdp.agents.planners import plan as plan
+    from jaxpomdp.envs.drawing import draw as draw
     from jaxpomdp.envs.hallway import hallway as hallway
     from jaxpomdp.envs.hallway import hallway_navigation as hallway_navigation
     from jaxpomdp.envs.maze89 import heading_maze as heading_maze
@@ -37,6 +42,12 @@ if TYPE_CHECKING:
     from jaxpomdp.envs.world import step_key as step_key
     from jaxpomdp.envs.wrappers import limited as limited
     from jaxpomdp.envs.wrappers import noisy as noisy
+    from jaxpomdp.experiments.config import RunConfig as RunConfig
+    from jaxpomdp.experiments.results import RunData as RunData
+    from jaxpomdp.experiments.results import load_run as load_run
+    from jaxpomdp.experiments.runner import run as run
+    from jaxpomdp.kernels.decoding import Decoded as Decoded
+    from jaxpomdp.kernels.decoding import viterbi as viterbi
     from jaxpomdp.kernels.filtering import Filtered as Filtered
     from jaxpomdp.kernels.filtering import filter_tape as filter_tape
     from jaxpomdp.kernels.filtering import observe as observe
@@ -44,7 +55,11 @@ if TYPE_CHECKING:
     from jaxpomdp.kernels.filtering import predict_observation as predict_observation
     from jaxpomdp.kernels.filtering import predict_steps as predict_steps
     from jaxpomdp.kernels.filtering import update_belief as update_belief
+    from jaxpomdp.kernels.planning import perseus as perseus
+    from jaxpomdp.kernels.planning import value_iteration as value_iteration
     from jaxpomdp.kernels.posterior import posterior as posterior
+    from jaxpomdp.kernels.sampling import sample_path as sample_path
+    from jaxpomdp.kernels.sampling import sample_posterior as sample_posterior
     from jaxpomdp.kernels.smoothing import smooth as smooth
     from jaxpomdp.models.data import trial_batch as trial_batch
     from jaxpomdp.models.em import EMConfig as EMConfig
@@ -73,6 +88,10 @@ if TYPE_CHECKING:
     from jaxpomdp.models.store import save as save
     from jaxpomdp.packing import pack as pack
     from jaxpomdp.packing import unpack as unpack
+    from jaxpomdp.structure.evidence import ReturnEvidence as ReturnEvidence
+    from jaxpomdp.structure.evidence import return_evidence as return_evidence
+    from jaxpomdp.structure.policy import PolicyConfig as PolicyConfig
+    from jaxpomdp.structure.policy import revise as revise
     from jaxpomdp.structure.spec import FlatSpec as FlatSpec
     from jaxpomdp.structure.splits import SplitConfig as SplitConfig
 
@@ -81,6 +100,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Categorical": "jaxpomdp.models.emission",
     "Chain": "jaxpomdp._types",
+    "Decoded": "jaxpomdp.kernels.decoding",
     "DiagonalGaussian": "jaxpomdp.models.emission",
     "EMConfig": "jaxpomdp.models.em",
     "EMReport": "jaxpomdp.models.em",
@@ -92,18 +112,26 @@ _HOMES = {
     "FullGaussian": "jaxpomdp.models.full_gaussian",
     "GradientConfig": "jaxpomdp.models.gradient",
     "ParsedPOMDP": "jaxpomdp.envs.pomdp_tables",
+    "PlannerConfig": "jaxpomdp.agents.planners",
+    "Policy": "jaxpomdp.agents.planners",
+    "PolicyConfig": "jaxpomdp.structure.policy",
     "Posterior": "jaxpomdp._types",
     "Prior": "jaxpomdp.models.family",
     "Real": "jaxpomdp.models.init",
+    "ReturnEvidence": "jaxpomdp.structure.evidence",
     "ReturnModel": "jaxpomdp.models.emission",
+    "RunConfig": "jaxpomdp.experiments.config",
+    "RunData": "jaxpomdp.experiments.results",
     "SplitConfig": "jaxpomdp.structure.splits",
     "Step": "jaxpomdp.envs.world",
     "TrialBatch": "jaxpomdp._types",
     "TrueModel": "jaxpomdp.envs.world",
     "World": "jaxpomdp.envs.world",
     "bic": "jaxpomdp.models.selection",
+    "draw": "jaxpomdp.envs.drawing",
     "e_step": "jaxpomdp.models.em",
     "em_step": "jaxpomdp.models.em",
+    "evaluate_policy": "jaxpomdp.agents.planners",
     "filter_tape": "jaxpomdp.kernels.filtering",
     "fit": "jaxpomdp.models.em",
     "fit_gradient": "jaxpomdp.models.gradient",
@@ -115,6 +143,7 @@ _HOMES = {
     "held_out": "jaxpomdp.models.selection",
     "limited": "jaxpomdp.envs.wrappers",
     "load": "jaxpomdp.models.store",
+    "load_run": "jaxpomdp.experiments.results",
     "log_evidence": "jaxpomdp.models.selection",
     "make": "jaxpomdp.envs.registry",
     "maze57": "jaxpomdp.envs.maze89",
@@ -124,6 +153,8 @@ _HOMES = {
     "observation_seeded": "jaxpomdp.models.init",
     "observe": "jaxpomdp.kernels.filtering",
     "pack": "jaxpomdp.packing",
+    "perseus": "jaxpomdp.kernels.planning",
+    "plan": "jaxpomdp.agents.planners",
     "posterior": "jaxpomdp.kernels.posterior",
     "predict": "jaxpomdp.kernels.filtering",
     "predict_observation": "jaxpomdp.kernels.filtering",
@@ -133,6 +164,11 @@ _HOMES = {
     "read_pomdpx": "jaxpomdp.envs.pomdpx",
     "reset": "jaxpomdp.envs.world",
     "reset_key": "jaxpomdp.envs.world",
+    "return_evidence": "jaxpomdp.structure.evidence",
+    "revise": "jaxpomdp.structure.policy",
+    "run": "jaxpomdp.experiments.runner",
+    "sample_path": "jaxpomdp.kernels.sampling",
+    "sample_posterior": "jaxpomdp.kernels.sampling",
     "save": "jaxpomdp.models.store",
     "smooth": "jaxpomdp.kernels.smoothing",
     "step": "jaxpomdp.envs.world",
@@ -143,6 +179,8 @@ _HOMES = {
     "trial_batch": "jaxpomdp.models.data",
     "unpack": "jaxpomdp.packing",
     "update_belief": "jaxpomdp.kernels.filtering",
+    "value_iteration": "jaxpomdp.kernels.planning",
+    "viterbi": "jaxpomdp.kernels.decoding",
     "write_pomdp": "jaxpomdp.envs.pomdp_write",
 }
 _ROOMS = ("agents", "cli", "envs", "experiments", "kernels", "models", "numerics", "packing", "structure")
