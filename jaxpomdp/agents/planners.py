@@ -1,4 +1,4 @@
-"""Planners on a model that is given: QMDP, most likely state, informed bound, Perseus; and how good a policy is.
+"""Planners on a given model: QMDP, most likely state, informed bound, Perseus; and how good a policy is.
 
 A policy is a set of vectors with actions: it takes the action of the vector with the largest ``alpha . b``.
 """
@@ -19,7 +19,7 @@ from jaxpomdp.envs import world as worlds
 from jaxpomdp.envs.world import TrueModel, World
 from jaxpomdp.kernels import planning
 from jaxpomdp.kernels.planning import Vectors
-from jaxpomdp.numerics import NEG, normalise, safe_log
+from jaxpomdp.numerics import NEG, normalise
 
 METHODS = ("perseus", "qmdp", "most-likely", "informed")
 
@@ -38,10 +38,12 @@ class PlannerConfig:
     """Perseus: beliefs to improve; half are drawn from those met, half are chosen far from each other."""
     rounds: int = 3
     """Perseus: how often beliefs are collected anew, by the policy found so far."""
-    sweeps: int = 40
+    sweeps: int = 20
     """Perseus: at most so many sweeps in a round."""
-    tolerance: float = 1e-4
-    """A round ends when no belief gains more; in units of the largest reward."""
+    slack: float = 0.01
+    """Perseus: a belief may lose this part of the spread of values in a sweep; fewer vectors, much faster."""
+    tolerance: float = 2e-4
+    """Perseus: a round ends when a sweep's mean gain is below this part of the spread of values."""
     explorers: int = 32
     """Simulated agents of each kind (random, most likely state, the policy so far) that collect beliefs."""
     horizon: int = 100
@@ -50,7 +52,7 @@ class PlannerConfig:
     """Chance that a random explorer repeats its action, without which it would not cross a long corridor."""
     epsilon: float = 0.1
     """Share of random actions of the other explorers."""
-    capacity: int = 256
+    capacity: int = 384
     """Perseus: room for so many vectors; doubled when it is full, which compiles anew."""
 
     def __post_init__(self) -> None:
@@ -65,10 +67,13 @@ class PlannerConfig:
             raise ValueError(f"beliefs must be at most 3 * explorers * horizon = {most}, got {self.beliefs}")
 
 
-class Policy(NamedTuple):
-    """``vectors[K, N]`` with their ``actions[K]``; ``sharpen[]`` takes the most likely state for certain first.
+DEFAULT = PlannerConfig()
 
-    A row that is not used holds ``NEG`` throughout.
+
+class Policy(NamedTuple):
+    """``vectors[K, N]`` with their ``actions[K]``; ``sharpen[]`` takes the most likely state for certain.
+
+    A row that is not used holds ``NEG`` throughout, so that policies from one planner have one shape.
     """
 
     vectors: Array
@@ -76,9 +81,20 @@ class Policy(NamedTuple):
     sharpen: Array
 
 
-def act(policy: Policy, belief: Array) -> Array:
-    """Return the action ``actions[argmax_k alpha_k . b]``, an int scalar, for one belief ``[N]``."""
-    certain = jax.nn.one_hot(jnp.argmax(belief), belief.shape[0], dtype=belief.dtype)
+def act(policy: Policy, belief: Array, uniform: Array) -> Array:
+    """Return the action ``actions[argmax_k alpha_k . b]`` for one belief.
+
+    Args:
+        policy: the vectors.
+        belief: ``[N]``.
+        uniform: a number in [0, 1) that picks among states that are exactly equally likely; only ``sharpen``
+            uses it. Taking always the first would run in circles in a world with symmetries.
+
+    Returns:
+        An int scalar.
+    """
+    state = _draw((belief >= jnp.max(belief)).astype(belief.dtype), uniform)
+    certain = jax.nn.one_hot(state, belief.shape[0], dtype=belief.dtype)
     belief = jnp.where(policy.sharpen, certain, belief)
     return policy.actions[jnp.argmax(policy.vectors @ belief)]
 
@@ -88,7 +104,7 @@ def value(policy: Policy, belief: Array) -> Array:
     return jnp.max(policy.vectors @ belief)
 
 
-def plan(model: TrueModel, discount: float, config: PlannerConfig = PlannerConfig(), *, seed: int = 0) -> Policy:
+def plan(model: TrueModel, discount: float, config: PlannerConfig = DEFAULT, *, seed: int = 0) -> Policy:
     """Plan on a model.
 
     Args:
@@ -107,8 +123,8 @@ def plan(model: TrueModel, discount: float, config: PlannerConfig = PlannerConfi
         >>> from jaxpomdp.envs.hallway import hallway_navigation
         >>> from jaxpomdp.envs.world import model_of
         >>> policy = plan(model_of(hallway_navigation()), 0.9, PlannerConfig("qmdp"))
-        >>> policy.vectors.shape[0]
-        4
+        >>> policy.actions.tolist()
+        [0, 1, 2, 3]
     """
     if not 0 <= discount < 1:
         raise ValueError(f"discount must lie in [0, 1), got {discount}")
@@ -126,29 +142,41 @@ def _simple(table: Array, sharpen: bool = False) -> Policy:
     return Policy(table, jnp.arange(table.shape[0], dtype=jnp.int32), jnp.array(sharpen))
 
 
-def _perseus(model: TrueModel, discount: float, config: PlannerConfig, key: Array, heuristic: Policy) -> Policy:
-    """Alternate between collecting beliefs and sweeping over them; the vectors are a lower bound throughout."""
+def _perseus(
+    model: TrueModel, discount: float, config: PlannerConfig, key: Array, heuristic: Policy
+) -> Policy:
+    """Collect beliefs, sweep over them, and again; the vectors are a lower bound throughout."""
     blind = planning.blind_values(model.trans, model.reward, discount)
     vectors = _resized(Vectors(blind, heuristic.actions, jnp.int32(blind.shape[0])), config.capacity)
-    tolerance = config.tolerance * float(jnp.max(jnp.abs(model.reward)))
-    beliefs = jnp.zeros((0, *model.start.shape), model.trans.dtype)
+    beliefs = jnp.tile(model.start[None], (config.beliefs, 1))
     for r in range(config.rounds):
         collecting, searching = jax.random.split(jax.random.fold_in(key, r))
         beliefs = _collect(collecting, model, _guides(heuristic, vectors), beliefs, config)
-        vectors = _search(searching, beliefs, vectors, model, discount, config.sweeps, tolerance)
-    return jax.tree.map(lambda x: x[: int(vectors.count)] if x.ndim else x, _policy_of(vectors))
+        vectors = _search(searching, beliefs, vectors, model, discount, config)
+    return _policy_of(vectors)
 
 
 def _search(
-    key: Array, beliefs: Array, vectors: Vectors, model: TrueModel, discount: float, sweeps: int, tolerance: float
+    key: Array, beliefs: Array, vectors: Vectors, model: TrueModel, discount: float, config: PlannerConfig
 ) -> Vectors:
     """Run Perseus, again in a larger buffer each time that it was full."""
-    tables = model.trans, model.obs, model.reward, discount
+    left = config.sweeps
     while True:
-        vectors, left, full = planning.perseus(key, beliefs, vectors, *tables, sweeps, tolerance)
+        vectors, left, full = planning.perseus(
+            key,
+            beliefs,
+            vectors,
+            model.trans,
+            model.obs,
+            model.reward,
+            discount,
+            left,
+            config.slack,
+            config.tolerance,
+        )
         if not bool(full):
             return vectors
-        vectors, sweeps = _resized(vectors, 2 * vectors.actions.shape[0]), int(left)
+        vectors = _resized(vectors, 2 * vectors.actions.shape[0])
 
 
 def _resized(vectors: Vectors, capacity: int) -> Vectors:
@@ -163,7 +191,7 @@ def _policy_of(vectors: Vectors) -> Policy:
 
 
 def _guides(heuristic: Policy, vectors: Vectors) -> Policy:
-    """Return the three policies that collect beliefs, stacked: for the random one, any; most likely state; so far."""
+    """Return the policies that collect beliefs, stacked: any (for random), most likely state, so far."""
     so_far = _policy_of(vectors)
     rows = jnp.full_like(so_far.vectors, NEG).at[: heuristic.actions.shape[0]].set(heuristic.vectors)
     actions = jnp.zeros_like(so_far.actions).at[: heuristic.actions.shape[0]].set(heuristic.actions)
@@ -179,7 +207,7 @@ def _collect(key: Array, model: TrueModel, guides: Policy, known: Array, config:
     keys = jax.random.split(walking, (3, config.explorers))
     walk = jax.vmap(partial(_wander, model, config), in_axes=(None, None, 0))
     met = jax.vmap(walk)(guides, epsilon, keys).reshape(-1, model.start.shape[0])
-    drawn = jax.random.choice(drawing, met, (config.beliefs - config.beliefs // 2,), replace=False)
+    drawn = met[jax.random.randint(drawing, (config.beliefs - config.beliefs // 2,), 0, met.shape[0])]
     pool = jnp.concatenate([known, met])
     far = planning.spread(spreading, pool, config.beliefs // 2)
     return jnp.concatenate([drawn, pool[far]])
@@ -193,34 +221,32 @@ class _Explorer(NamedTuple):
 
 def _wander(model: TrueModel, config: PlannerConfig, guide: Policy, epsilon: Array, key: Array) -> Array:
     """Return the beliefs ``[horizon, N]`` that one agent comes by; it begins anew after a terminal state."""
+    num_actions = model.trans.shape[0]
 
-    def step(now: _Explorer, key: Array) -> tuple[_Explorer, Array]:
-        keys = jax.random.split(key, 6)
-        any_action = jax.random.randint(keys[0], (), 0, model.trans.shape[0])
-        repeat, explore = jax.random.uniform(keys[1], (2,))
-        random = jnp.where(repeat < config.sticky, now.action, any_action)
-        action = jnp.where(explore < epsilon, random, act(guide, now.belief))
-        state = _draw(keys[2], model.trans[action, now.state])
+    def step(now: _Explorer, uniform: Array) -> tuple[_Explorer, Array]:
+        anything = (uniform[0] * num_actions).astype(jnp.int32)
+        random = jnp.where(uniform[1] < config.sticky, now.action, anything)
+        action = jnp.where(uniform[2] < epsilon, random, act(guide, now.belief, uniform[3]))
+        state = _draw(model.trans[action, now.state], uniform[4])
         seen_after = action if model.obs.shape[0] > 1 else 0
-        observation = _draw(keys[3], model.obs[seen_after, state])
+        observation = _draw(model.obs[seen_after, state], uniform[5])
         belief = planning.update(now.belief, action, observation, model.trans, model.obs)
-        on = _Explorer(state, belief, action)
-        fresh = _begin(model, keys[4])
+        on, fresh = _Explorer(state, belief, action), _begin(model, uniform[6:8], anything)
         return jax.tree.map(lambda x, y: jnp.where(model.terminal[state], x, y), fresh, on), now.belief
 
-    first, *rest = jax.random.split(key, 1 + config.horizon)
-    return lax.scan(step, _begin(model, first), jnp.stack(rest))[1]
+    uniforms = jax.random.uniform(key, (config.horizon, 8))
+    return lax.scan(step, _begin(model, uniforms[-1, 6:8], jnp.int32(0)), uniforms)[1]
 
 
-def _begin(model: TrueModel, key: Array) -> _Explorer:
-    for_state, for_observation, for_action = jax.random.split(key, 3)
-    state = _draw(for_state, model.start)
-    belief = first_belief(model, _draw(for_observation, model.first[state]))
-    return _Explorer(state, belief, jax.random.randint(for_action, (), 0, model.trans.shape[0]))
+def _begin(model: TrueModel, uniforms: Array, action: Array) -> _Explorer:
+    state = _draw(model.start, uniforms[0])
+    return _Explorer(state, first_belief(model, _draw(model.first[state], uniforms[1])), action)
 
 
-def _draw(key: Array, prob: Array) -> Array:
-    return jax.random.categorical(key, safe_log(prob))
+def _draw(prob: Array, uniform: Array) -> Array:
+    """Return an index drawn from ``prob[K]``; the scaled uniform keeps clear of a sum rounded below one."""
+    total = jnp.cumsum(prob)
+    return jnp.sum(total <= uniform * total[-1], dtype=jnp.int32)
 
 
 def first_belief(model: TrueModel, observation: Array) -> Array:
@@ -241,7 +267,7 @@ def evaluate_policy(
         seed: of the draws, which depend on (seed, trial, step) alone.
 
     Returns:
-        ``steps`` int, ``reward``, ``discounted`` (``sum_t gamma^t r_t``) and ``success`` bool, each ``[trials]``.
+        ``steps`` int, ``reward``, ``discounted`` = ``sum_t gamma^t r_t``, ``success``, each ``[trials]``.
     """
     model = worlds.model_of(world) if model is None else model
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(trials))
@@ -264,28 +290,33 @@ class _Trial(NamedTuple):
 @jax.jit
 def _evaluate(world: World, policy: Policy, model: TrueModel, keys: Array) -> _Trial:
     """Run one trial for each key, all side by side, until the last is over."""
+    draw = partial(jax.random.uniform, shape=(world.step_limit + 1, worlds.UNIFORMS_PER_STEP + 1))
+    uniforms = jax.vmap(draw)(keys)
     advance = jax.vmap(partial(_advance, world, policy, model), in_axes=(0, 0, None))
 
     def going(carry: tuple[Array, _Trial]) -> Array:
         return (carry[0] < world.step_limit) & ~jnp.all(carry[1].over)
 
     def body(carry: tuple[Array, _Trial]) -> tuple[Array, _Trial]:
-        return carry[0] + 1, advance(carry[1], keys, carry[0])
+        return carry[0] + 1, advance(carry[1], uniforms[:, carry[0]], carry[0])
 
-    begin = jax.vmap(partial(_first_step, world, model))(keys)
+    begin = jax.vmap(partial(_first_step, world, model))(uniforms[:, -1])
     return lax.while_loop(going, body, (jnp.zeros((), jnp.int32), begin))[1]
 
 
-def _first_step(world: World, model: TrueModel, key: Array) -> _Trial:
-    state, observation = worlds.reset_key(world, jax.random.fold_in(key, world.step_limit))
+def _first_step(world: World, model: TrueModel, uniforms: Array) -> _Trial:
+    state, observation = worlds.reset(world, uniforms[: worlds.UNIFORMS_PER_RESET])
     nothing = jnp.zeros((), world.reward.dtype)
     over = world.terminal[state]
-    return _Trial(state, first_belief(model, observation), over, jnp.int32(0), nothing, nothing, jnp.array(False))
+    belief = first_belief(model, observation)
+    return _Trial(state, belief, over, jnp.int32(0), nothing, nothing, jnp.array(False))
 
 
-def _advance(world: World, policy: Policy, model: TrueModel, now: _Trial, key: Array, t: Array) -> _Trial:
-    action = act(policy, now.belief)
-    out = worlds.step_key(world, now.state, action, jax.random.fold_in(key, t))
+def _advance(
+    world: World, policy: Policy, model: TrueModel, now: _Trial, uniforms: Array, t: Array
+) -> _Trial:
+    action = act(policy, now.belief, uniforms[-1])
+    out = worlds.step(world, now.state, action, uniforms[:-1])
     after = _Trial(
         out.state,
         planning.update(now.belief, action, out.observation, model.trans, model.obs),

@@ -12,6 +12,7 @@ from jaxpomdp.envs.pomdp_lexer import ANY, Note
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+
 class RewardRules(NamedTuple):
     """Rewards as ``M`` rules in the order written; a later one overrides an earlier one, no rule means 0.
 

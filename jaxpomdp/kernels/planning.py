@@ -1,7 +1,7 @@
 """Planning on a known model: values of states, bounds on the value of beliefs, and point-based backups.
 
-A model is ``trans[A, N, N]``, ``obs[1 or A, N, O]`` at the state arrived in, ``reward[A, N]`` and a discount below
-one; ``end_trials`` makes its terminal states worthless for ever. The value of a belief is the largest
+A model is ``trans[A, N, N]``, ``obs[1 or A, N, O]`` at the state arrived in, ``reward[A, N]`` and a discount
+below one; ``end_trials`` makes its terminal states worthless for ever. The value of a belief is the largest
 ``alpha . b`` over a set of vectors, each of which stands for a plan and the action it begins with.
 
 For every belief: ``point-based <= best achievable <= informed bound <= QMDP`` (Hauskrecht 2000).
@@ -20,7 +20,7 @@ from jaxpomdp.numerics import NEG, normalise
 
 
 class Vectors(NamedTuple):
-    """``vectors[K, N]`` with the ``actions[K]`` they begin with; rows from ``count[]`` on are not used yet."""
+    """``vectors[K, N]`` with the ``actions[K]`` they begin with; rows from ``count[]`` on are not used."""
 
     vectors: Array
     actions: Array
@@ -65,8 +65,8 @@ def value_iteration(
     """Solve the fully observed problem: ``Q(a, s) = r(a, s) + gamma sum_s' T(s, a, s') max_a' Q(a', s')``.
 
     Returns:
-        ``Q[A, N]``. As vectors it is QMDP (Littman, Cassandra and Kaelbling 1995), an upper bound on the value of
-        every belief, since it takes the state as known after one step.
+        ``Q[A, N]``. As vectors it is QMDP (Littman, Cassandra and Kaelbling 1995), an upper bound on the
+        value of every belief, since it takes the state as known after one step.
     """
 
     def update(q: Array) -> Array:
@@ -105,10 +105,10 @@ def blind_values(trans: Array, reward: Array, discount: float) -> Array:
 def backup(
     belief: Array, current: Vectors, trans: Array, obs: Array, reward: Array, discount: float
 ) -> tuple[Array, Array]:
-    """Return the vector of the best plan at a belief, one step longer than those of ``current``, and its action.
+    """Return the best plan's vector at a belief, a step longer than those of ``current``, and its action.
 
-    ``alpha_a(s) = r(a, s) + gamma sum_s' T(s, a, s') sum_o O(a, s', o) alpha^{a, o}(s')`` where ``alpha^{a, o}`` is
-    the best of ``current`` after ``a`` and ``o``; of these the one with the largest ``alpha_a . b``.
+    ``alpha_a(s) = r(a, s) + gamma sum_s' T(s, a, s') sum_o O(a, s', o) alpha^{a, o}(s')`` where
+    ``alpha^{a, o}`` is the best of ``current`` after ``a`` and ``o``; of these the largest ``alpha_a . b``.
 
     Returns:
         ``alpha[N]`` and an int scalar.
@@ -133,66 +133,90 @@ def value_at(beliefs: Array, current: Vectors) -> tuple[Array, Array]:
 
 
 class _Sweep(NamedTuple):
-    """Inside one sweep: the new vectors, what each belief is worth under them, and a key."""
+    """Inside one sweep: the new vectors, what each belief is worth under them, backups done, and a key."""
 
     new: Vectors
     worth: Array
+    done: Array
     key: Array
 
 
+LEAST = 32
+"""Backups in a sweep at least: if the first vector already holds every belief, others may still gain."""
+
+
 def sweep(
-    key: Array, beliefs: Array, current: Vectors, trans: Array, obs: Array, reward: Array, discount: float
+    key: Array,
+    beliefs: Array,
+    current: Vectors,
+    trans: Array,
+    obs: Array,
+    reward: Array,
+    discount: float,
+    slack: float = 0.0,
 ) -> Vectors:
     """Improve every belief by backing up only some of them (Perseus; Spaan and Vlassis 2005).
 
-    A belief that is not yet worth at least as much as before is drawn and backed up; the new vector often improves
-    many others as well, which then need none of their own.
+    A belief that is not yet worth as much as before is drawn and backed up; the new vector often improves
+    many others as well, which then need none of their own. A little slack spares the vectors that would only
+    defend the last digits of one belief each; every vector is still a plan's value, so the bound stays sound.
 
     Args:
         key: draws the beliefs.
         beliefs: ``[B, N]``.
         current: the vectors so far, whose shape is the capacity for the new ones too.
-        trans, obs, reward, discount: the model.
+        trans: of the model.
+        obs: of the model.
+        reward: of the model.
+        discount: below one.
+        slack: a belief may lose so much of the spread of values between beliefs.
 
     Returns:
-        The new vectors; if the capacity was not enough, ``count`` is the capacity and some beliefs are worse off.
+        The new vectors; if the capacity was not enough, ``count`` is the capacity and some beliefs are worse.
     """
     before, best_before = value_at(beliefs, current)
-    capacity = current.actions.shape[0]
+    margin = slack * jnp.ptp(before)
+
+    def waiting(carry: _Sweep) -> Array:
+        return carry.worth < before - margin
 
     def going(carry: _Sweep) -> Array:
-        return jnp.any(carry.worth < before) & (carry.new.count < capacity)
+        unfinished = jnp.any(waiting(carry)) | (carry.done < LEAST)
+        return unfinished & (carry.new.count < current.actions.shape[0])
 
     def once(carry: _Sweep) -> _Sweep:
         key, draw = jax.random.split(carry.key)
-        waiting = carry.worth < before
-        i = jnp.argmax(jnp.where(waiting, jax.random.uniform(draw, waiting.shape), -1))
+        still = waiting(carry)
+        i = jnp.argmax(jnp.where(still | ~jnp.any(still), jax.random.uniform(draw, still.shape), -1))
         alpha, action = backup(beliefs[i], current, trans, obs, reward, discount)
         better = alpha @ beliefs[i] >= before[i]
         alpha = jnp.where(better, alpha, current.vectors[best_before[i]])
         action = jnp.where(better, action, current.actions[best_before[i]])
-        worth = jnp.maximum(carry.worth, beliefs @ alpha)
-        # the drawn belief is done whatever rounding says, so the loop ends
-        worth = worth.at[i].max(before[i])
-        return _Sweep(_append(carry.new, alpha, action), worth, key)
+        kept = still[i] | (alpha @ beliefs[i] > carry.worth[i] + margin)
+        # a belief that was drawn is done whatever rounding says, so the loop ends
+        worth = jnp.maximum(carry.worth, beliefs @ alpha).at[i].max(before[i])
+        new = _append(carry.new, alpha, action, kept)
+        return _Sweep(new, jnp.where(kept, worth, carry.worth), carry.done + 1, key)
 
     none = Vectors(jnp.zeros_like(current.vectors), jnp.zeros_like(current.actions), jnp.zeros((), jnp.int32))
-    return lax.while_loop(going, once, _Sweep(none, jnp.full_like(before, -jnp.inf), key)).new
+    start = _Sweep(none, jnp.full_like(before, -jnp.inf), jnp.zeros((), jnp.int32), key)
+    return lax.while_loop(going, once, start).new
 
 
-def _append(vectors: Vectors, alpha: Array, action: Array) -> Vectors:
+def _append(vectors: Vectors, alpha: Array, action: Array, kept: Array) -> Vectors:
+    """Write one row behind the others; the next overwrites it unless it is ``kept``."""
     return Vectors(
         vectors.vectors.at[vectors.count].set(alpha),
         vectors.actions.at[vectors.count].set(action.astype(vectors.actions.dtype)),
-        vectors.count + 1,
+        vectors.count + kept,
     )
 
 
 class _Search(NamedTuple):
-    """Over all sweeps: the last complete vectors, the largest improvement, sweeps left, whether they overflowed."""
+    """Over all sweeps: the last complete vectors, do they improve, sweeps left, did one overflow."""
 
     vectors: Vectors
-    gain: Array
+    improving: Array
     left: Array
     full: Array
     key: Array
@@ -208,36 +232,40 @@ def perseus(
     reward: Array,
     discount: float,
     sweeps: int,
+    slack: float,
     tolerance: float,
 ) -> tuple[Vectors, Array, Array]:
-    """Sweep until no belief gains more than ``tolerance``, ``sweeps`` are spent, or the capacity is too small.
+    """Sweep until beliefs gain little, ``sweeps`` are spent, or the capacity is too small.
 
     Args:
         key: draws the beliefs to back up.
         beliefs: ``[B, N]``.
         current: vectors that are a lower bound already, such as ``blind_values``.
-        trans, obs, reward, discount: the model.
+        trans: of the model.
+        obs: of the model.
+        reward: of the model.
+        discount: below one.
         sweeps: at most so many.
-        tolerance: in units of value.
+        slack: see :func:`sweep`.
+        tolerance: stop when the mean gain of a sweep is below this part of the spread of values.
 
     Returns:
         The last complete vectors, how many sweeps are left, and whether a sweep overflowed the capacity.
     """
 
     def going(carry: _Search) -> Array:
-        return (carry.gain > tolerance) & (carry.left > 0) & ~carry.full
+        return carry.improving & (carry.left > 0) & ~carry.full
 
     def once(carry: _Search) -> _Search:
         key, draw = jax.random.split(carry.key)
-        new = sweep(draw, beliefs, carry.vectors, trans, obs, reward, discount)
-        gain = jnp.max(value_at(beliefs, new)[0] - value_at(beliefs, carry.vectors)[0])
+        new = sweep(draw, beliefs, carry.vectors, trans, obs, reward, discount, slack)
+        before, after_it = value_at(beliefs, carry.vectors)[0], value_at(beliefs, new)[0]
+        improving = jnp.mean(after_it - before) > tolerance * jnp.ptp(after_it)
         full = new.count >= new.actions.shape[0]
         kept = jax.tree.map(lambda old, fresh: jnp.where(full, old, fresh), carry.vectors, new)
-        return _Search(kept, gain, carry.left - 1, full, key)
+        return _Search(kept, improving, carry.left - 1, full, key)
 
-    start = _Search(
-        current, jnp.full((), jnp.inf, beliefs.dtype), jnp.asarray(sweeps), jnp.zeros((), bool), key
-    )
+    start = _Search(current, jnp.array(True), jnp.asarray(sweeps), jnp.array(False), key)
     end = lax.while_loop(going, once, start)
     return end.vectors, end.left, end.full
 

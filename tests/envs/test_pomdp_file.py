@@ -135,8 +135,8 @@ def test_reward_rows_and_matrices():
 
 
 def test_words_may_wrap_and_names_may_look_like_keywords():
-    text = "discount\n:\n0.9 values: costs states:\n# four\n T # one\n O E\n start\nactions: R observations: x T: R\n"
-    text += "identity O:R:T:x 1 O: R : * : x 1.0 R: R : E : * : * 5 E: O\n"
+    text = "discount\n:\n0.9 values: costs states:\n# four\n T # one\n O E\n start\n"
+    text += "actions: R observations: x T: R\nidentity O:R:T:x 1 O: R : * : x 1.0 R: R : E : * : * 5 E: O\n"
     parsed = read_pomdp(text)
     assert (parsed.states, parsed.actions, parsed.values) == (("T", "O", "E", "start"), ("R",), "cost")
     assert parsed.end_states == (1,)

@@ -18,10 +18,12 @@ class Dense(NamedTuple):
 
 def read_dense(text: str) -> Dense:
     text = re.sub(r"#.*", "", text)
-    chunks = re.split(r"(?:^|\n)\s*(discount|values|states|actions|observations|start\s*\w*|E|T|O|R)\s*:", text)
+    keywords = r"discount|values|states|actions|observations|start\s*\w*|E|T|O|R"
+    chunks = re.split(rf"(?:^|\n)\s*({keywords})\s*:", text)
     pairs = list(zip(chunks[1::2], chunks[2::2], strict=True))
-    names = {kind: _names(body.split()) for kind, body in pairs if kind in ("states", "actions", "observations")}
-    states, actions, observations = (len(names[k]) for k in ("states", "actions", "observations"))
+    lists = ("states", "actions", "observations")
+    names = {kind: _names(body.split()) for kind, body in pairs if kind in lists}
+    states, actions, observations = (len(names[k]) for k in lists)
     start = np.full(states, 1 / states)
     for kind, body in pairs:
         if kind.startswith("start"):
@@ -36,7 +38,8 @@ def read_dense(text: str) -> Dense:
     for kind, body in pairs:
         if kind in tables:
             _paint(tables[kind], [names[k] for k in kinds[kind]], body, start)
-    for state in [names["states"].index(word) for kind, body in pairs if kind == "E" for word in body.split()]:
+    ends = [word for kind, body in pairs if kind == "E" for word in body.split()]
+    for state in map(names["states"].index, ends):
         missing = tables["T"][:, state].sum(axis=-1) == 0
         tables["T"][missing, state, state] = 1
     for letter in "TO":
@@ -64,7 +67,10 @@ def _paint(table, names, body, start):
     parts = [part.split() for part in body.split(":")]
     words = [part[0] for part in parts]
     values = parts[-1][1:]
-    where = tuple(slice(None) if word == "*" else _number(word, known) for word, known in zip(words, names))
+    where = tuple(
+        slice(None) if word == "*" else _number(word, known)
+        for word, known in zip(words, names, strict=False)
+    )
     where += (slice(None),) * (table.ndim - len(where))
     shape = table.shape[len(words) :]
     if values == ["uniform"]:
