@@ -39,7 +39,7 @@ def demo(config: RunConfig, out: Path, *, progress: str = "auto", make: Build = 
 
 def comparison_table(data: RunData) -> str:
     """Return the thesis's Table 3.1 with what was just measured below it."""
-    rows = [("89-state maze, 251 steps at most", "goal %", "median steps")]
+    rows: list[tuple[str, ...]] = [("89-state maze, 251 steps at most", "goal %", "median steps")]
     rows += [
         (f"thesis: {name}", str(t["goal_percent"]), str(t["median_steps"])) for name, t in TARGETS.items()
     ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,6 +14,7 @@ from jaxpomdp.experiments.plots import COLOURS, INK, PALE, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
@@ -74,20 +76,20 @@ def _draw_arrows(
         if i == j:
             continue
         arrow = FancyArrowPatch(
-            tuple(place[i]),
-            tuple(place[j]),
+            (float(place[i, 0]), float(place[i, 1])),
+            (float(place[j, 0]), float(place[j, 1])),
             connectionstyle="arc3,rad=0.14",
             arrowstyle="-|>,head_width=2.4,head_length=4",
-            shrinkA=size[i] * points,
-            shrinkB=size[j] * points,
-            linewidth=2.4 * following[i, j],
+            shrinkA=float(size[i]) * points,
+            shrinkB=float(size[j]) * points,
+            linewidth=2.4 * float(following[i, j]),
             color=COLOURS[graph.action[i] % len(COLOURS)],
-            alpha=0.25 + 0.6 * following[i, j],
+            alpha=0.25 + 0.6 * float(following[i, j]),
         )
         ax.add_patch(arrow)
 
 
-def _draw_nodes(ax: Axes, graph: ModelGraph, place: np.ndarray, size: np.ndarray) -> object:
+def _draw_nodes(ax: Axes, graph: ModelGraph, place: np.ndarray, size: np.ndarray) -> PatchCollection:
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Circle
 
@@ -108,7 +110,8 @@ def _draw_observations(
         sides = sensed_sides(world, int(observation))
         if sides is None:
             name = world.observation_names[observation].replace(" ", "\n")
-            ax.text(*place[state], name, ha="center", va="center", fontsize=6, color=ink, zorder=5)
+            x, y = place[state]
+            ax.text(x, y, name, ha="center", va="center", fontsize=6, color=ink, zorder=5)
         for side in sides or ():
             ends = _bar(place[state], size[state], SIDES[side])
             ax.plot(*ends, color=ink, linewidth=2.2, solid_capstyle="butt", zorder=4)

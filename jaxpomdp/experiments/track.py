@@ -29,8 +29,9 @@ class Tracker:
 
     def write(self, group: str, trial: int, values: Mapping[str, np.ndarray]) -> None:
         """Write the mean over seeds of each value ``[S, ...]`` at a trial."""
-        for name, value in values.items() if self._writer is not None else ():
-            self._writer.add_scalar(f"{group}/{name}", float(np.mean(value)), trial)
+        if self._writer is not None:
+            for name, value in values.items():
+                self._writer.add_scalar(f"{group}/{name}", float(np.mean(value)), trial)
 
     def close(self) -> None:
         """Flush what was written."""

@@ -53,7 +53,8 @@ def walk(world: World, mind: Mind, seed: int, trial: int, limit: int | None = No
         beliefs.append(mind.follow(beliefs[-1], action, observation))
         if over:
             break
-    return Walk(*(np.array(x) for x in (states, seen, actions, rewards)), np.stack(beliefs))
+    columns = (np.array(states), np.array(seen), np.array(actions), np.array(rewards))
+    return Walk(*columns, np.stack(beliefs))
 
 
 def meaning(world: World, walks: Iterable[Walk]) -> np.ndarray:
