@@ -1,0 +1,381 @@
+"""The agent: the online phase, the offline phase, and what is carried between them.
+
+``make_agent`` builds one by name; ``run`` does one round of trials and learning for all seeds at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpomdp import packing
+from jaxpomdp._types import Array
+from jaxpomdp.agents import experience, learner
+from jaxpomdp.agents.control import ControlConfig, Schedule
+from jaxpomdp.agents.experience import Experience
+from jaxpomdp.agents.learner import LearnerConfig
+from jaxpomdp.agents.trial import Actor, Log, run_trials
+from jaxpomdp.envs.world import World
+from jaxpomdp.models import init as starts
+from jaxpomdp.models.family import Family
+from jaxpomdp.models.flat import FLAT
+from jaxpomdp.numerics import bucket
+from jaxpomdp.structure.policy import revise
+from jaxpomdp.structure.splits import STATE_SPLIT
+
+GREEDY = Schedule(0.0, 0.0, 1, "constant")
+"""Exploration while an agent is judged."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """All settings of an agent; ``learner`` None means that its model stays as it is given."""
+
+    control: ControlConfig = field(default_factory=ControlConfig)
+    """How actions are chosen and valued."""
+    learner: LearnerConfig | None = field(default_factory=LearnerConfig)
+    """How the model is learned."""
+
+
+class Best(NamedTuple):
+    """The best policy so far: its models, its values, and its average discounted reward ``[S]``."""
+
+    params: Any
+    q: Array
+    score: np.ndarray
+
+
+class AgentState(NamedTuple):
+    """Everything an agent carries, with leading axis ``S``; a pytree of arrays, so it can be stored.
+
+    ``rest[S, N]`` counts the phases for which a state is not split again; ``recent[S, K]`` holds the
+    discounted reward of the latest trials, newest last (NaN where there was none).
+    """
+
+    params: Any
+    actor: Actor
+    experience: Experience
+    rest: np.ndarray
+    recent: np.ndarray
+    best: Best
+
+
+class Agent:
+    """An agent in a tabular world: many seeds at once, each with a model, values and chance of its own.
+
+    Args:
+        world: where it acts.
+        config: its settings.
+        family: the kind of model.
+        fixed: ``(seeds) -> (params, q)`` with leading ``S``: a model that is given, and where values start;
+            by default the model is learned from nothing.
+
+    Raises:
+        ValueError: neither a learner nor a model is given.
+    """
+
+    def __init__(self, world: World, config: AgentConfig, family: Family = FLAT, fixed: Any = None) -> None:
+        if config.learner is None and fixed is None:
+            raise ValueError("config.learner must be given where no fixed model is, got None")
+        self.world, self.config, self.family, self.fixed = world, config, family, fixed
+        self.log: list[dict[str, Any]] = []
+        """A row for every structure edit made by this object."""
+
+    def init(self, seeds: Any) -> AgentState:
+        """Return the state before the first trial.
+
+        Args:
+            seeds: ints ``[S]``; equal seeds give equal runs in equal company.
+        """
+        seeds = np.asarray(seeds, np.int64)
+        params, q = self._start(seeds)
+        keys = jax.vmap(lambda seed: jax.random.key_data(jax.random.key(seed)))(jnp.asarray(seeds, jnp.uint32))
+        zero = jnp.zeros(len(seeds), jnp.int32)
+        window = self.config.learner.window if self.config.learner else 1
+        store = experience.no_experience(len(seeds), window, (np.int32(0),))
+        kept = (self.config.learner.keep_best if self.config.learner else 0) or 1
+        return AgentState(
+            params,
+            Actor(keys, q, zero, zero),
+            store,
+            np.zeros(params.alive.shape, np.int64),
+            np.full((len(seeds), kept), np.nan),
+            Best(params, q, np.full(len(seeds), -np.inf)),
+        )
+
+    def _start(self, seeds: np.ndarray) -> tuple[Any, Array]:
+        if self.fixed is not None:
+            return self.fixed(seeds)
+        settings = self.config.learner
+        make = starts.observation_seeded if settings.initial == "observation" else starts.random_params
+        capacity = self._capacity(settings.states)
+        sizes = (settings.states, self.world.num_actions, self.world.num_observations)
+        options = {"by_action": settings.return_by_action, "capacity": capacity}
+        params = starts.stack_models([make(int(seed), *sizes, **options) for seed in seeds])
+        shape = (len(seeds), capacity, self.world.num_actions)
+        return params, jnp.full(shape, self.config.control.optimism, jnp.float32)
+
+    def _capacity(self, states: int) -> int:
+        return bucket(states, cap=max(self.config.learner.policy.node_cap, states))
+
+    def run(self, state: AgentState) -> tuple[AgentState, dict[str, np.ndarray]]:
+        """Do one round: a phase of trials, then what is learned from them.
+
+        Returns:
+            The new state, and rows: ``steps``, ``reward``, ``discounted``, ``success`` of shape ``[S, trials]``;
+            per seed ``states``, ``log_evidence``, ``epsilon`` and seconds spent ``acting``, ``fitting``,
+            ``structure``, ``replaying`` (the same for all seeds).
+        """
+        settings, clock = self.config.learner, _Clock()
+        trials = settings.trials_per_phase if settings else 50
+        actor, log, count = run_trials(
+            self.family, self.config.control, self.world, state.params, state.actor, trials=trials
+        )
+        new = experience.split_log(log, int(count))
+        rows = summarise(new, self.world)
+        clock.lap("acting")
+        state = self._judge(state._replace(actor=actor), rows["discounted"])
+        evidence = np.zeros(len(new))
+        if settings:
+            state = state._replace(experience=experience.remember(state.experience, new))
+            state, evidence = self._learn(state, clock)
+        return state, rows | self._phase_rows(state, evidence, clock)
+
+    def _phase_rows(self, state: AgentState, evidence: np.ndarray, clock: _Clock) -> dict[str, np.ndarray]:
+        level = self.config.control.schedule.function()(state.actor.steps)
+        seconds = {name: np.full(len(evidence), spent) for name, spent in clock.spent.items()}
+        return {
+            "states": np.asarray(jnp.sum(state.params.alive, axis=-1)),
+            "log_evidence": evidence,
+            "epsilon": np.broadcast_to(np.asarray(level), evidence.shape),
+        } | seconds
+
+    def _judge(self, state: AgentState, discounted: np.ndarray) -> AgentState:
+        """Note how the latest trials went, and keep a copy of the policy that did best on average."""
+        if not (self.config.learner and self.config.learner.keep_best):
+            return state
+        width = state.recent.shape[1]
+        recent = np.concatenate([state.recent, discounted], axis=1)[:, -width:]
+        average = np.where(np.isnan(recent).any(axis=1), -np.inf, np.mean(np.nan_to_num(recent), axis=1))
+        better = average > state.best.score
+        score = np.where(better, average, state.best.score)
+        best = learner.select(jnp.asarray(better), (state.params, state.actor.q), (state.best.params, state.best.q))
+        return state._replace(recent=recent, best=Best(*best, score))
+
+    def _learn(self, state: AgentState, clock: _Clock) -> tuple[AgentState, np.ndarray]:
+        settings = self.config.learner
+        tapes = experience.tapes_of(state.experience)
+        batch = jax.device_put(tapes.batch)
+        options = {"gamma": settings.return_gamma, "bootstrap": settings.bootstrap}
+        batch = learner.with_returns(batch, jnp.asarray(tapes.tail), **options)
+        held = self._held(state)
+        refit = partial(learner.refit, self.family, config=learner.em_config(settings))
+        params, evidence = state.params, np.zeros(len(held))
+        if settings.em_iterations and not held.all():
+            params, found = refit(params, batch, jnp.asarray(held), iterations=settings.em_iterations)
+            evidence = np.asarray(found)
+        clock.lap("fitting")
+        state, grew = self._split(state._replace(params=params), batch, tapes.trial, held)
+        clock.lap("structure")
+        if grew.any() and settings.split_iterations:
+            params, _ = refit(state.params, batch, jnp.asarray(~grew), iterations=settings.split_iterations)
+            state = state._replace(params=params)
+        clock.lap("fitting", after=state.params)
+        return self._replay(state, batch, clock), evidence
+
+    def _held(self, state: AgentState) -> np.ndarray:
+        """Say which seeds do well enough to leave their model alone: ``std / |mean|`` of start returns is low."""
+        settings = self.config.learner
+        if not settings.gate:
+            return np.zeros(len(state.recent), bool)
+        latest = experience.start_returns(state.experience, settings.return_gamma, latest=settings.gate_trials)
+        return np.array([len(r) > 1 and r.mean() > 0 and r.std() < settings.gate * r.mean() for r in latest])
+
+    def _split(
+        self, state: AgentState, batch: Any, trial: np.ndarray, held: np.ndarray
+    ) -> tuple[AgentState, np.ndarray]:
+        settings = self.config.learner
+        policy = settings.policy
+        phase = int(np.max(np.asarray(state.actor.trials))) // settings.trials_per_phase - 1
+        due = phase >= policy.first_phase and (phase - policy.first_phase) % policy.every == 0
+        alive = np.asarray(state.params.alive)
+        if not due or not policy.edits_per_phase or (held | (alive.sum(-1) >= policy.node_cap)).all():
+            return state, np.zeros(len(held), bool)
+        config = learner.em_config(settings)
+        found = learner.gather_evidence(self.family, state.params, batch, jnp.asarray(trial), config, settings.bins)
+        arrays = jax.device_get(found)
+        specs, origins, rests = packing.unpack_all(state.params), [], []
+        for s, spec in enumerate(specs):
+            rest = state.rest[s, : spec.num_states]
+            if held[s] or spec.num_states >= policy.node_cap:
+                origins.append(np.arange(spec.num_states))
+                rests.append(rest)
+                continue
+            rng = np.random.default_rng((int(np.asarray(state.actor.keys)[s, -1]), phase))
+            revision = revise(
+                spec,
+                learner.evidence_of_seed(arrays, s, alive[s]),
+                phase=phase,
+                rest=rest,
+                policy=policy,
+                operators=((STATE_SPLIT, settings.split),),
+                rng=rng,
+            )
+            specs[s] = revision.spec
+            origins.append(revision.origin)
+            rests.append(revision.rest)
+            self.log += [{"seed_index": s} | row for row in revision.rows]
+        return self._repacked(state, specs, origins, rests)
+
+    def _repacked(
+        self, state: AgentState, specs: list[Any], origins: list[np.ndarray], rests: list[np.ndarray]
+    ) -> tuple[AgentState, np.ndarray]:
+        before = np.asarray(jnp.sum(state.params.alive, axis=-1))
+        grew = np.array([len(origin) for origin in origins]) > before
+        if not grew.any():
+            return state, grew
+        capacity = max(self._capacity(spec.num_states) for spec in specs)
+        capacity = max(capacity, state.params.alive.shape[1])
+        params = packing.pack(specs, capacity)
+        q = packing.carry(state.actor.q, origins, capacity)
+        rest = np.zeros((len(rests), capacity), np.int64)
+        for row, kept in zip(rest, rests, strict=True):
+            row[: len(kept)] = kept
+        best = state.best
+        if capacity > best.params.alive.shape[1]:
+            old = packing.unpack_all(best.params)
+            kept_q = packing.carry(best.q, [np.arange(spec.num_states) for spec in old], capacity)
+            best = Best(packing.pack(old, capacity), kept_q, best.score)
+        return state._replace(params=params, actor=replace(state.actor, q=q), rest=rest, best=best), grew
+
+    def _replay(self, state: AgentState, batch: Any, clock: _Clock) -> AgentState:
+        settings, control = self.config.learner, self.config.control
+        if not settings.replay_passes:
+            return state
+        lam = control.lam if settings.replay_lam is None else settings.replay_lam
+        q = learner.replay(self.family, state.params, batch, state.actor.q, control, settings.replay_passes, lam)
+        clock.lap("replaying", after=q)
+        return state._replace(actor=replace(state.actor, q=q))
+
+    def evaluate(self, state: AgentState, trials: int, key: Array) -> dict[str, np.ndarray]:
+        """Act greedily without learning: ``steps``, ``reward``, ``discounted``, ``success``, each ``[S, trials]``.
+
+        Args:
+            state: the agent.
+            trials: for each seed.
+            key: of the chance in these trials, the same for any ``state``.
+        """
+        seeds = state.recent.shape[0]
+        keys = jax.vmap(lambda s: jax.random.key_data(jax.random.fold_in(key, s)))(jnp.arange(seeds))
+        zero = jnp.zeros(seeds, jnp.int32)
+        actor = Actor(keys, state.actor.q, zero, zero)
+        control = replace(self.config.control, schedule=GREEDY, exploration="epsilon", alpha=0.0)
+        _, log, count = run_trials(self.family, control, self.world, state.params, actor, trials=trials)
+        return summarise(experience.split_log(log, int(count)), self.world)
+
+    def finish(self, state: AgentState) -> AgentState:
+        """Return the agent as it ends: where an earlier policy was better on average, that one."""
+        if not (self.config.learner and self.config.learner.keep_best):
+            return state
+        now = np.mean(state.recent, axis=1)
+        worse = jnp.asarray(state.best.score > now)
+        params, q = learner.select(worse, (state.best.params, state.best.q), (state.params, state.actor.q))
+        return state._replace(params=params, actor=replace(state.actor, q=q))
+
+
+class _Clock:
+    """Seconds spent by name."""
+
+    def __init__(self) -> None:
+        self.spent = dict.fromkeys(("acting", "fitting", "structure", "replaying"), 0.0)
+        self._last = time.perf_counter()
+
+    def lap(self, name: str, after: Any = None) -> None:
+        """Charge the time since the last lap to ``name``, once ``after`` is computed."""
+        jax.block_until_ready(after)
+        now = time.perf_counter()
+        self.spent[name] += now - self._last
+        self._last = now
+
+
+def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.ndarray]:
+    """Return what each trial came to: ``steps``, ``reward``, ``discounted`` and ``success``, ``[S, trials]``."""
+    rows = [_summary(seed, world) for seed in trials]
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def _summary(trials: experience.Trials, world: World) -> dict[str, np.ndarray]:
+    begins = np.cumsum(trials.lengths) - trials.lengths
+    inside = np.arange(len(trials.rewards)) - np.repeat(begins, trials.lengths)
+    last_reward = trials.rewards[begins + trials.lengths - 2]
+    return {
+        "steps": trials.lengths - 1,
+        "reward": np.add.reduceat(trials.rewards, begins),
+        "discounted": np.add.reduceat(trials.rewards * world.discount**inside, begins),
+        "success": trials.terminated & (last_reward > world.success_above),
+    }
+
+
+def with_settings(config: Any, settings: Mapping[str, Any]) -> Any:
+    """Return a (nested) dataclass with settings changed by name: ``theta`` or ``learner.split.stay``.
+
+    A bare name must belong to one field only, or to the outermost field of that name.
+
+    Raises:
+        ValueError: no such setting, or a name that more than one part has.
+    """
+    for name, value in settings.items():
+        config = _with(config, _path(config, name), value)
+    return config
+
+
+def _with(config: Any, path: tuple[str, ...], value: Any) -> Any:
+    if len(path) > 1:
+        value = _with(getattr(config, path[0]), path[1:], value)
+    return replace(config, **{path[0]: value})
+
+
+def _path(config: Any, name: str) -> tuple[str, ...]:
+    wanted = tuple(name.split("."))
+    paths = [path for path in _paths(config) if path[-len(wanted) :] == wanted]
+    shallow = [path for path in paths if len(path) == min(map(len, paths))]
+    if len(shallow) == 1:
+        return shallow[0]
+    if shallow:
+        raise ValueError(f"setting {name!r} is ambiguous: {', '.join('.'.join(p) for p in shallow)}")
+    known = ", ".join(".".join(path) for path in _paths(config))
+    raise ValueError(f"setting {name!r} is unknown; the settings are {known}")
+
+
+def _paths(config: Any, prefix: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    found = []
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        found.append((*prefix, item.name))
+        if dataclasses.is_dataclass(value):
+            found += _paths(value, (*prefix, item.name))
+    return found
+
+
+def make_agent(name: str, world: World, **settings: Any) -> Agent:
+    """Return an agent by name, with some settings changed.
+
+    Args:
+        name: one of ``agents.presets.names()``.
+        world: where it will act.
+        **settings: by name, such as ``theta=0.2`` or ``**{"learner.split.stay": 0.9}``.
+
+    Raises:
+        ValueError: the agent or a setting is unknown.
+    """
+    from jaxpomdp.agents import presets
+
+    return presets.make(name, world, settings)

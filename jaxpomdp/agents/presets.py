@@ -1,0 +1,98 @@
+"""Agents by name: the thesis's settings, ours, and the references."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from jaxpomdp.agents.agent import Agent, AgentConfig, with_settings
+from jaxpomdp.agents.control import ControlConfig, Schedule
+from jaxpomdp.agents.learner import LearnerConfig
+from jaxpomdp.envs.world import World
+from jaxpomdp.structure.policy import PolicyConfig
+from jaxpomdp.structure.splits import SplitConfig
+
+UDHMM = AgentConfig(
+    ControlConfig(alpha=0.03, gamma=0.95, lam=0.95, schedule=Schedule(0.2, 0.0, 250_000)),
+    LearnerConfig(theta=0.0, policy=PolicyConfig(node_cap=70, edits_per_phase=1)),
+)
+"""The 89-state maze at its best: 25 to 70 states, a window of 200 trials, one replay pass."""
+
+THESIS = AgentConfig(
+    ControlConfig(alpha=0.01, gamma=0.95, lam=0.9, schedule=Schedule(0.2, 0.0, 350_000)),
+    LearnerConfig(
+        theta=0.2,
+        bootstrap=False,
+        window=50,
+        trials_per_phase=10,
+        em_iterations=1,
+        replay_passes=0,
+        keep_best=0,
+        policy=PolicyConfig(node_cap=70, edits_per_phase=1, every=5),
+    ),
+)
+"""As thesis section 3.5.3 says, with Loch and Singh's parameters of control."""
+
+TMAZE = AgentConfig(
+    ControlConfig(alpha=0.03, gamma=0.98, lam=0.98, schedule=Schedule(0.2, 0.0, 20_000), sticky=0.9),
+    LearnerConfig(
+        states=8,
+        theta=0.2,
+        return_gamma=0.999,
+        return_by_action=True,
+        window=100,
+        trials_per_phase=5,
+        em_iterations=1,
+        replay_passes=1,
+        gate=0.3,
+        split=SplitConfig(stay=0.9),
+        policy=PolicyConfig(node_cap=20, edits_per_phase=1),
+    ),
+)
+"""The T-maze: returns by action with a discount of their own, and a gate."""
+
+HALLWAY = AgentConfig(
+    ControlConfig(alpha=0.1, gamma=0.9, lam=0.9, schedule=Schedule(0.1, 0.1, 1, "constant"), optimism=2.0),
+    LearnerConfig(
+        states=17,
+        theta=0.2,
+        return_gamma=0.9,
+        return_by_action=True,
+        window=30,
+        trials_per_phase=5,
+        em_iterations=1,
+        replay_passes=3,
+        gate=0.3,
+        keep_best=30,
+        policy=PolicyConfig(node_cap=40, edits_per_phase=1),
+    ),
+)
+"""The hallway: optimistic values, three replay passes, a gate."""
+
+LEARNERS: Mapping[str, AgentConfig] = {
+    "udhmm": UDHMM,
+    "udhmm-thesis": THESIS,
+    "udhmm-tmaze": TMAZE,
+    "udhmm-hallway": HALLWAY,
+    "pda": replace(
+        UDHMM, learner=replace(UDHMM.learner, theta=0.0, policy=PolicyConfig(node_cap=70, edits_per_phase=0))
+    ),
+}
+"""Agents that learn a model; ``pda`` is the Perceptual Distinctions Approach (Chrisman, 1992)."""
+
+
+def names() -> tuple[str, ...]:
+    """Return the names that :func:`make` knows."""
+    return tuple(sorted(LEARNERS))
+
+
+def make(name: str, world: World, settings: Mapping[str, Any]) -> Agent:
+    """Return an agent by name; see ``make_agent``.
+
+    Raises:
+        ValueError: the agent or a setting is unknown.
+    """
+    if name not in LEARNERS:
+        raise ValueError(f"agent must be one of {', '.join(names())}, got {name!r}")
+    return Agent(world, with_settings(LEARNERS[name], settings))
