@@ -1,7 +1,4 @@
-"""Planners on a given model: QMDP, most likely state, informed bound, Perseus; and how good a policy is.
-
-A policy is a set of vectors with actions: it takes the action of the vector with the largest ``alpha . b``.
-"""
+"""Planners on a given model: QMDP, most likely state, informed bound, and Perseus."""
 
 from __future__ import annotations
 
@@ -11,15 +8,14 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from jaxpomdp._types import Array
-from jaxpomdp.envs import world as worlds
-from jaxpomdp.envs.world import TrueModel, World
+from jaxpomdp.agents.policies import Policy, act, first_belief
+from jaxpomdp.envs.world import TrueModel
 from jaxpomdp.kernels import planning
 from jaxpomdp.kernels.planning import Vectors
-from jaxpomdp.numerics import NEG, normalise
+from jaxpomdp.numerics import NEG
 
 METHODS = ("perseus", "qmdp", "most-likely", "informed")
 
@@ -67,44 +63,10 @@ class PlannerConfig:
             raise ValueError(f"beliefs must be at most 3 * explorers * horizon = {most}, got {self.beliefs}")
 
 
-DEFAULT = PlannerConfig()
+PERSEUS = PlannerConfig()
 
 
-class Policy(NamedTuple):
-    """``vectors[K, N]`` with their ``actions[K]``; ``sharpen[]`` takes the most likely state for certain.
-
-    A row that is not used holds ``NEG`` throughout, so that policies from one planner have one shape.
-    """
-
-    vectors: Array
-    actions: Array
-    sharpen: Array
-
-
-def act(policy: Policy, belief: Array, uniform: Array) -> Array:
-    """Return the action ``actions[argmax_k alpha_k . b]`` for one belief.
-
-    Args:
-        policy: the vectors.
-        belief: ``[N]``.
-        uniform: a number in [0, 1) that picks among states that are exactly equally likely; only ``sharpen``
-            uses it. Taking always the first would run in circles in a world with symmetries.
-
-    Returns:
-        An int scalar.
-    """
-    state = _draw((belief >= jnp.max(belief)).astype(belief.dtype), uniform)
-    certain = jax.nn.one_hot(state, belief.shape[0], dtype=belief.dtype)
-    belief = jnp.where(policy.sharpen, certain, belief)
-    return policy.actions[jnp.argmax(policy.vectors @ belief)]
-
-
-def value(policy: Policy, belief: Array) -> Array:
-    """Return ``max_k alpha_k . b`` for one belief: for Perseus what the policy earns at least from there."""
-    return jnp.max(policy.vectors @ belief)
-
-
-def plan(model: TrueModel, discount: float, config: PlannerConfig = DEFAULT, *, seed: int = 0) -> Policy:
+def plan(model: TrueModel, discount: float, config: PlannerConfig = PERSEUS, *, seed: int = 0) -> Policy:
     """Plan on a model.
 
     Args:
@@ -247,83 +209,3 @@ def _draw(prob: Array, uniform: Array) -> Array:
     """Return an index drawn from ``prob[K]``; the scaled uniform keeps clear of a sum rounded below one."""
     total = jnp.cumsum(prob)
     return jnp.sum(total <= uniform * total[-1], dtype=jnp.int32)
-
-
-def first_belief(model: TrueModel, observation: Array) -> Array:
-    """Return the belief ``[N]`` after the observation at a reset."""
-    return normalise(model.start * model.first[:, observation], model.start)
-
-
-def evaluate_policy(
-    world: World, policy: Policy, *, model: TrueModel | None = None, trials: int = 251, seed: int = 0
-) -> dict[str, np.ndarray]:
-    """Let a policy act in a world and say how each trial went.
-
-    Args:
-        world: where it acts, for at most ``world.step_limit`` actions a trial.
-        policy: from :func:`plan`.
-        model: what it tracks its belief by; by default the truth.
-        trials: how many, side by side.
-        seed: of the draws, which depend on (seed, trial, step) alone.
-
-    Returns:
-        ``steps`` int, ``reward``, ``discounted`` = ``sum_t gamma^t r_t``, ``success``, each ``[trials]``.
-    """
-    model = worlds.model_of(world) if model is None else model
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(trials))
-    rows = _evaluate(world, policy, model, keys)
-    return {name: np.asarray(getattr(rows, name)) for name in ("steps", "reward", "discounted", "success")}
-
-
-class _Trial(NamedTuple):
-    """One trial under way; when it is over nothing changes any more."""
-
-    state: Array
-    belief: Array
-    over: Array
-    steps: Array
-    reward: Array
-    discounted: Array
-    success: Array
-
-
-@jax.jit
-def _evaluate(world: World, policy: Policy, model: TrueModel, keys: Array) -> _Trial:
-    """Run one trial for each key, all side by side, until the last is over."""
-    draw = partial(jax.random.uniform, shape=(world.step_limit + 1, worlds.UNIFORMS_PER_STEP + 1))
-    uniforms = jax.vmap(draw)(keys)
-    advance = jax.vmap(partial(_advance, world, policy, model), in_axes=(0, 0, None))
-
-    def going(carry: tuple[Array, _Trial]) -> Array:
-        return (carry[0] < world.step_limit) & ~jnp.all(carry[1].over)
-
-    def body(carry: tuple[Array, _Trial]) -> tuple[Array, _Trial]:
-        return carry[0] + 1, advance(carry[1], uniforms[:, carry[0]], carry[0])
-
-    begin = jax.vmap(partial(_first_step, world, model))(uniforms[:, -1])
-    return lax.while_loop(going, body, (jnp.zeros((), jnp.int32), begin))[1]
-
-
-def _first_step(world: World, model: TrueModel, uniforms: Array) -> _Trial:
-    state, observation = worlds.reset(world, uniforms[: worlds.UNIFORMS_PER_RESET])
-    nothing = jnp.zeros((), world.reward.dtype)
-    over = world.terminal[state]
-    belief = first_belief(model, observation)
-    return _Trial(state, belief, over, jnp.int32(0), nothing, nothing, jnp.array(False))
-
-
-def _advance(
-    world: World, policy: Policy, model: TrueModel, now: _Trial, uniforms: Array, t: Array
-) -> _Trial:
-    action = act(policy, now.belief, uniforms[-1])
-    out = worlds.step(world, now.state, action, uniforms[:-1])
-    after = _Trial(
-        out.state,
-        planning.update(now.belief, action, out.observation, model.trans, model.obs),
-        out.terminated,
-        now.steps + 1,
-        now.reward + out.reward,
-        now.discounted + world.discount**t * out.reward,
-        out.terminated & (out.reward > world.success_above),
-    )
-    return jax.tree.map(lambda x, y: jnp.where(now.over, x, y), now, after)

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxpomdp.agents.planners import PlannerConfig, Policy, act, evaluate_policy, plan, value
+from jaxpomdp.agents.planners import PlannerConfig, plan
+from jaxpomdp.agents.policies import Policy, act, evaluate_policy, value
 from jaxpomdp.envs.hallway import hallway_navigation
 from jaxpomdp.envs.maze89 import maze57, maze89
 from jaxpomdp.envs.pomdp_file import read_pomdp
