@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxpomdp._types import Array, Chain
-from jaxpomdp.numerics import NEG, log_sum_exp, safe_log
+from jaxpomdp.numerics import NEG, safe_log
 
 EXACT = lax.Precision.HIGHEST
 """Matrix products in the full precision of their dtype: accelerators would round float32 to fewer bits."""
@@ -52,11 +52,15 @@ def observe(predicted: Array, log_obs: Array) -> tuple[Array, Array]:
         >>> [round(float(p), 3) for p in belief], round(float(jnp.exp(log_norm)), 3)
         ([0.9, 0.1], 0.5)
     """
-    log_joint = safe_log(predicted) + log_obs
-    log_norm = log_sum_exp(log_joint)
-    possible = log_norm > NEG / 2
-    belief = jnp.where(possible, jnp.exp(log_joint - log_norm), predicted)
-    return belief, jnp.where(possible, log_norm, NEG)
+    # Shift by the best likelihood within reach before adding: sums of small numbers keep their last digits.
+    shift = lax.stop_gradient(jnp.max(jnp.where(predicted > 0, log_obs, NEG)))
+    log_joint = safe_log(predicted) + (log_obs - shift)
+    peak = lax.stop_gradient(jnp.max(log_joint))
+    joint = jnp.exp(log_joint - peak)
+    total = jnp.sum(joint)
+    possible = shift > NEG / 2
+    belief = jnp.where(possible, joint / total, predicted)
+    return belief, jnp.where(possible, jnp.log(total) + peak + shift, NEG)
 
 
 def propagate(belief: Array, trans: Array, action: Array) -> Array:

@@ -13,6 +13,7 @@ the rounding of the dtype.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -114,12 +115,13 @@ def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
     def step(carried: Array, inputs: tuple[Array, ...]) -> tuple[Array, Filtered]:
         row, action, first = inputs
         predicted = jnp.where(first, chain.log_init, carried)
-        joint = jnp.maximum(predicted + row, NEG)
-        log_norm = log_sum_exp(joint)
-        possible = log_norm > NEG / 2
-        belief = jnp.where(possible, jnp.where(joint > NEG / 2, joint - log_norm, NEG), predicted)
+        shift = jnp.max(jnp.where(predicted > NEG / 2, row, NEG))
+        possible = shift > NEG / 2
+        joint = jnp.maximum(predicted + (row - shift), NEG)
+        norm = log_sum_exp(joint)
+        belief = jnp.where(possible, jnp.where(joint > NEG / 2, joint - norm, NEG), predicted)
         following = _log_product(belief, chain.log_trans[action])
-        return following, Filtered(belief, predicted, jnp.where(possible, log_norm, NEG))
+        return following, Filtered(belief, predicted, jnp.where(possible, norm + shift, NEG))
 
     rows = jnp.where(valid[:, None], log_obs, 0)
     _, (belief, predicted, log_norm) = lax.scan(
@@ -129,41 +131,54 @@ def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
     return Filtered(belief, predicted, jnp.where(valid, log_norm, 0))
 
 
-def _backward_exact(log_trans: Array, log_obs: Array, actions: Array, linked: Array) -> Array:
-    """Return ``log future[T, N]`` up to a constant per step; as ``backward_weights``, in logarithms."""
+def _backward_exact(log_trans: Array, rows: Array, actions: Array, linked: Array) -> Array:
+    """Return ``log future[T, N]`` up to a constant per step; as ``backward_weights``, in logarithms.
+
+    ``rows[T, N]`` are ``NEG`` in states out of reach, which then do not set the scale for the others.
+    """
 
     def step(following: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
         row, action, goes_on = inputs
-        beta = _log_product(following, log_trans[action].T)
+        beta = jnp.where(row > NEG / 2, _log_product(following, log_trans[action].T), NEG)
         beta = jnp.where(goes_on, beta - jnp.max(beta), 0)
         future = jnp.maximum(jnp.where(beta > NEG / 2, row + beta, NEG), NEG)
         return future, future
 
-    return lax.scan(step, jnp.zeros_like(log_obs[0]), (log_obs, actions, linked), reverse=True)[1]
+    return lax.scan(step, jnp.zeros_like(rows[0]), (rows, actions, linked), reverse=True)[1]
 
 
-def _exp_difference(x: Array, norm: Array) -> Array:
-    """Return ``exp(x - norm)``, and zero where ``x`` stands for the logarithm of zero."""
-    return jnp.where(x > NEG / 2, jnp.exp(x - norm), 0)
+def _heeded_rows(predicted: Array, log_obs: Array) -> Array:
+    """Shift rows by the best likelihood within reach; ``NEG`` out of reach, zeros at an impossible step."""
+    reachable = predicted > NEG / 2
+    best = jnp.max(jnp.where(reachable, log_obs, NEG), axis=-1, keepdims=True)
+    heeded = jnp.where(best > NEG / 2, jnp.maximum(log_obs - best, NEG), 0)
+    return jnp.where(reachable, heeded, NEG)
+
+
+def _shares(log_weight: Array) -> Array:
+    """Return ``exp(log_weight)`` scaled to sum to one over all entries; zeros when all are ``NEG``.
+
+    Divided by its own sum, so that what large logarithms lose to rounding is lost to all entries alike.
+    """
+    weight = jnp.where(log_weight > NEG / 2, jnp.exp(log_weight - jnp.max(log_weight)), 0)
+    total = jnp.sum(weight)
+    return weight / jnp.where(total > 0, total, 1)
 
 
 def smooth_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
     """Smooth one tape in logarithms: the textbook definition, slow and exact; arguments as ``smooth``."""
     linked = linked_steps(start, valid)
     filtered = filter_exact(chain, log_obs, actions, start, valid)
-    heeded = valid & (filtered.log_norm > NEG / 2)
-    rows = jnp.where(heeded[:, None], jnp.maximum(log_obs, NEG), 0)
+    rows = _heeded_rows(filtered.predicted, log_obs)
     future = _backward_exact(chain.log_trans, rows, actions, linked)
-    joint = jnp.maximum(filtered.predicted + future, NEG)
-    overlap = log_sum_exp(joint)
-    gamma = _exp_difference(joint, overlap[:, None])
+    gamma = jax.vmap(_shares)(filtered.predicted + future)
 
     def count(xi: Array, inputs: tuple[Array, ...]) -> tuple[Array, None]:
-        belief, arriving, norm, action, goes_on = inputs
-        pair = belief[:, None] + chain.log_trans[action] + arriving[None, :]
-        return xi.at[action].add(jnp.where(goes_on, _exp_difference(pair, norm), 0)), None
+        belief, arriving, action, goes_on = inputs
+        pair = _shares(belief[:, None] + chain.log_trans[action] + arriving[None, :])
+        return xi.at[action].add(jnp.where(goes_on, pair, 0)), None
 
-    steps = (filtered.belief, jnp.roll(future, -1, axis=0), jnp.roll(overlap, -1), actions, linked)
+    steps = (filtered.belief, jnp.roll(future, -1, axis=0), actions, linked)
     xi, _ = lax.scan(count, jnp.zeros_like(chain.log_trans), steps)
     initial = jnp.sum(jnp.where(trial_starts(start, valid)[:, None], gamma, 0), axis=0)
     return Posterior(jnp.sum(filtered.log_norm), gamma, xi, initial)
