@@ -70,6 +70,10 @@ class Categorical:
         """Return the expected log-likelihood of counted data, per state ``[N]``."""
         return estimates.dirichlet_score(self.log_prob, counts)
 
+    def as_counts(self, strength: float | Array) -> Array:
+        """Return the counts that ``strength`` typical observations of each state would give, ``[N, O]``."""
+        return strength * jnp.exp(self.log_prob)
+
     def to_free(self) -> Array:
         """Return logits."""
         return self.log_prob
@@ -123,6 +127,14 @@ class _MeanAndVariance:
     def expected(self, statistics: GaussianStatistics) -> Array:
         """Return the expected log-likelihood of the data behind the moments, per state ``[N]``."""
         return estimates.gaussian_score(self.mean, self.var, statistics.states)
+
+    def as_counts(self, strength: float | Array) -> GaussianStatistics:
+        """Return the moments that ``strength`` typical data of each entry would give."""
+        weight = jnp.full_like(self.mean, strength)
+        nothing = jnp.zeros_like(self.mean[:1])
+        return GaussianStatistics(
+            Moments(weight, self.mean, weight * self.var), Moments(nothing[:, :1], nothing, nothing)
+        )
 
     def to_free(self) -> dict[str, Array]:
         """Return means and log variances."""

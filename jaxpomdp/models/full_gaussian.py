@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ import numpy as np
 from jaxpomdp._types import Array, pytree
 from jaxpomdp.models import estimates
 from jaxpomdp.models.emission import GaussianStatistics, check_vectors, pooled_width
-from jaxpomdp.models.estimates import LOG_TWO_PI
+from jaxpomdp.models.estimates import LOG_TWO_PI, Moments
 from jaxpomdp.models.family import Prior
 
 
@@ -63,7 +61,7 @@ class FullGaussian:
 
     def feasible(self, x: Array, mask: Array, prior: Prior, carry: GaussianStatistics | None) -> FullGaussian:
         """Lift covariances to the floor that the data set."""
-        return replace(self, cov=_lifted(self.cov, pooled_width(x, mask, carry), prior))
+        return FullGaussian(self.mean, _lifted(self.cov, pooled_width(x, mask, carry), prior))
 
     def log_prior(self, statistics: GaussianStatistics, prior: Prior) -> Array:
         """Return the log density of the inverse Wishart prior, up to a constant, per state ``[N]``."""
@@ -83,6 +81,13 @@ class FullGaussian:
         whiten, log_det = self._whitening()
         precision = jnp.einsum("nij,nik->njk", whiten, whiten, precision="highest")
         return weight * log_det + jnp.sum(precision * scatter, axis=(-2, -1))
+
+    def as_counts(self, strength: float | Array) -> GaussianStatistics:
+        """Return the moments that ``strength`` typical data of each state would give."""
+        weight = jnp.full_like(self.mean[:, :1], strength)
+        nothing = jnp.zeros_like(self.mean[:1])
+        states = Moments(weight, self.mean, weight[..., None] * self.cov)
+        return GaussianStatistics(states, Moments(nothing[:, :1], nothing, nothing))
 
     def to_free(self) -> dict[str, Array]:
         """Return means and Cholesky factors with a logarithmic diagonal."""

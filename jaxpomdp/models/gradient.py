@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxpomdp._types import Array, TrialBatch
+from jaxpomdp._types import Array, Posterior, TrialBatch
 from jaxpomdp.kernels.filtering import filter_tape
-from jaxpomdp.models.em import EMConfig, as_models, em_step
+from jaxpomdp.models.em import as_models
 from jaxpomdp.models.family import Family, Prior
 
 
@@ -91,12 +91,23 @@ def _ascend_one(
     return family.from_free(params, end.best, config.prior), trace
 
 
+def _no_posterior(family: Family, params: Any, batch: TrialBatch) -> Posterior:
+    """Return a posterior without weight: its statistics say what the data are like, nothing of states."""
+    chain = family.acting(params)
+    gamma = jnp.zeros((*batch.valid.shape, chain.log_init.shape[-1]), chain.log_init.dtype)
+    nothing = jax.tree.map(jnp.zeros_like, chain)
+    return Posterior(gamma[..., 0, 0], gamma, nothing.log_trans, nothing.log_init)
+
+
 @partial(jax.jit, static_argnames=("family", "config", "optimiser"))
 def _ascend(
     family: Family, params: Any, batch: TrialBatch, config: GradientConfig, optimiser: Any
 ) -> tuple[Any, Array]:
-    _, info = em_step(family, params, batch, EMConfig(theta=config.theta, prior=config.prior))
-    return jax.vmap(partial(_ascend_one, family, config, optimiser))(params, batch, info.statistics)
+    def one(model: Any, tapes: TrialBatch) -> tuple[Any, Array]:
+        statistics = family.statistics(model, tapes, _no_posterior(family, model, tapes))
+        return _ascend_one(family, config, optimiser, model, tapes, statistics)
+
+    return jax.vmap(one)(params, batch)
 
 
 def fit_gradient(

@@ -136,7 +136,7 @@ def observation_seeded(
 def _generator(key: Array | int) -> np.random.Generator:
     if isinstance(key, (int, np.integer)):
         return np.random.default_rng(int(key))
-    typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     words = np.asarray(jax.random.key_data(key) if typed else key)
     if words.ndim != 1:
         raise ValueError(f"key must be one key (one call per model), got keys of shape {words.shape[:-1]}")

@@ -55,7 +55,7 @@ def test_a_failed_save_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.M
     save(path, {"x": np.arange(2)})
     before = path.read_bytes()
 
-    def broken(file, **arrays):
+    def broken(file, allow_pickle, **arrays):
         file.write(b"half")
         raise OSError("disk full")
 
