@@ -47,7 +47,7 @@ def unflatten(template: Any, arrays: Mapping[str, np.ndarray], file: Path | str 
         file: named in errors.
 
     Raises:
-        DamagedFileError: a path is missing or unknown, or an array's type or rank is not the template's.
+        DamagedFileError: a path is missing or unknown, or an array has another kind of type or rank.
     """
     leaves, structure = jax.tree_util.tree_flatten_with_path(template)
     paths = [jax.tree_util.keystr(path) for path, _ in leaves]
@@ -66,9 +66,9 @@ def _check_paths(expected: set[str], found: set[str], file: Path | str) -> None:
 def _like(leaf: Any, array: np.ndarray, path: str, file: Path | str) -> Any:
     """Return ``array`` as the kind of thing that the template's leaf is."""
     expected = np.asarray(_plain(leaf))
-    if array.dtype != expected.dtype or array.ndim != expected.ndim:
+    if array.dtype.kind != expected.dtype.kind or array.ndim != expected.ndim:
         raise DamagedFileError(
-            f"{file}: {path} must be {expected.dtype} of rank {expected.ndim}, "
+            f"{file}: {path} must be like {expected.dtype} of rank {expected.ndim}, "
             f"got {array.dtype} of rank {array.ndim}"
         )
     if _is_key(leaf):

@@ -6,6 +6,7 @@
     versions.json     what the run was computed with, and on what
     trials.csv        a row per seed and training trial
     phases.csv        a row per seed and phase of the agent
+    edits.jsonl       an object per structure edit
     evaluations.csv   a row per seed and greedy evaluation
     final.csv         a row per seed and greedy trial of the agent as it ended
     checkpoint.npz    the agent's whole state, and how much of each table belongs to it
@@ -40,14 +41,16 @@ from jaxpomdp.experiments.config import differences
 SCORES = ("goal_percent", "median_steps", "mean_steps", "mean_reward", "mean_discounted")
 TABLES = {
     "trials": ("seed", "trial", "steps", "reward", "discounted", "success"),
-    "phases": ("seed", "trial", "states_alive", "log_evidence"),
+    "phases": ("seed", "trial", "states", "log_evidence", "epsilon"),
     "evaluations": ("seed", "trial", *SCORES),
 }
+LOGS = ("edits",)
+"""Tables of objects, one JSON value a line."""
 FINAL_COLUMNS = TABLES["trials"]
 OURS = (".lock", "versions.json")
 PACKAGES = ("jaxpomdp", "jax", "jaxlib", "numpy", "scipy", "optax")
 
-Rows = Sequence[Sequence[Any]]
+Rows = Sequence[Any]
 
 
 class RunDirectoryError(ValueError):
@@ -107,11 +110,17 @@ class RunDirectory:
         write_atomically(self.path / "final.csv", table_text([FINAL_COLUMNS, *rows]).encode())
         write_json(self.path / "summary.json", dict(summary))
 
+    def _file(self, name: str) -> Path:
+        return self.path / (f"{name}.csv" if name in TABLES else f"{name}.jsonl")
+
     def _append(self, name: str, rows: Rows) -> None:
-        header = "" if name in self._marks else table_text([TABLES[name]])
-        data = (header + table_text(rows)).encode()
+        if not rows:
+            return
+        header = [] if name in self._marks or name not in TABLES else [TABLES[name]]
+        text = table_text([*header, *rows]) if name in TABLES else lines_text(rows)
+        data = text.encode()
         size, checksum = self._marks.get(name, [0, 0])
-        with open(self.path / f"{name}.csv", "ab") as file:
+        with open(self._file(name), "ab") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
@@ -119,8 +128,8 @@ class RunDirectory:
 
     def _cut(self, marks: Mapping[str, Sequence[int]]) -> None:
         """Cut every table back to what the checkpoint knows of it."""
-        for name in TABLES:
-            file = self.path / f"{name}.csv"
+        for name in (*TABLES, *LOGS):
+            file = self._file(name)
             if name not in marks:
                 file.unlink(missing_ok=True)
             else:
@@ -204,6 +213,11 @@ def table_text(rows: Rows) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([_cell(x) for x in row] for row in rows)
     return text.getvalue()
+
+
+def lines_text(rows: Sequence[Any]) -> str:
+    """Return objects as JSON, one a line."""
+    return "".join(json.dumps(row, default=lambda x: x.tolist()) + "\n" for row in rows)
 
 
 def _cell(x: Any) -> Any:

@@ -10,10 +10,11 @@ import numpy as np
 from jaxpomdp.experiments.config import differences, digest
 from jaxpomdp.experiments.experiment import summarise
 from jaxpomdp.experiments.plots import Curve, Line, learning_curves, moving_average
-from jaxpomdp.experiments.record import RunDirectoryError
+from jaxpomdp.experiments.record import RunDirectoryError, read_json
 from jaxpomdp.experiments.restore import find_runs
 from jaxpomdp.experiments.results import RunData, load_run, merge_runs, score
 from jaxpomdp.experiments.stats import format_interval, median_run
+from jaxpomdp.experiments.stopwatch import in_words
 
 SHOWN = {"goal_percent": "goal %", "median_steps": "median steps", "mean_discounted": "discounted reward"}
 DIGITS = {"mean_discounted": 3}
@@ -52,7 +53,8 @@ def run_report(path: Path) -> str:
     """Return the final scores of a complete run."""
     run = load_run(path)
     count = run.final["steps"].shape[1]
-    return f"{count} greedy trials per seed, as it ended:\n{score_report(run.seeds, run.final)}"
+    spent = in_words(read_json(path / "summary.json")["seconds"])
+    return f"{count} greedy trials per seed, as it ended:\n{score_report(run.seeds, run.final)}\n{spent}"
 
 
 def sweep_report(paths: Iterable[Path]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxpomdp.experiments.record import RunDirectoryError, read_json, read_table
 
+PER_PHASE = ("states", "log_evidence", "epsilon")
 PER_TRIAL = ("steps", "reward", "discounted", "success")
 Columns = Mapping[str, np.ndarray]
 
@@ -45,6 +46,19 @@ def evaluation_rows(seeds: Sequence[int], trial: int, trials: Columns) -> list[t
     return [(seed, trial, *(float(column[s]) for column in columns)) for s, seed in enumerate(seeds)]
 
 
+def phase_rows(seeds: Sequence[int], trial: int, phase: Columns) -> list[tuple]:
+    """Return a row per seed for the table of phases; what an agent does not report is NaN."""
+    nothing = [float("nan")] * len(seeds)
+    columns = [phase.get(name, nothing) for name in PER_PHASE]
+    return [(seed, trial, *(column[s] for column in columns)) for s, seed in enumerate(seeds)]
+
+
+def edit_row(seeds: Sequence[int], trial: int, edit: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a structure edit with the seed and the trial after which it was made."""
+    rest = {name: x for name, x in edit.items() if name != "seed_index"}
+    return {"seed": seeds[edit["seed_index"]], "trial": trial} | rest
+
+
 class RunData(NamedTuple):
     """A finished or unfinished run as arrays; columns are ``[S, rows]``, in the order of ``seeds``."""
 
@@ -68,8 +82,8 @@ def load_run(path: Path) -> RunData:
         raise RunDirectoryError(f"{path} is no run directory (jaxpomdp train makes one): no config.json")
     config = read_json(path / "config.json")
     tables = {name: _by_seed(path / f"{name}.csv") for name in ("trials", "evaluations", "phases", "final")}
-    done = read_json(path / "summary.json") if (path / "summary.json").exists() else {"seconds": 0.0}
-    return RunData(path, config, config["run"]["seeds"], **tables, seconds=done["seconds"])
+    done = read_json(path / "summary.json") if (path / "summary.json").exists() else {"seconds": {"all": 0.0}}
+    return RunData(path, config, config["run"]["seeds"], **tables, seconds=done["seconds"]["all"])
 
 
 def _by_seed(file: Path) -> dict[str, np.ndarray]:

@@ -14,7 +14,8 @@ import numpy as np
 from jaxpomdp.experiments.config import EVALUATION_SEED, RunConfig, describe, did_you_mean
 from jaxpomdp.experiments.progress import Progress
 from jaxpomdp.experiments.record import RunDirectory, changed_versions, open_run
-from jaxpomdp.experiments.results import evaluation_rows, score, trial_rows
+from jaxpomdp.experiments.results import edit_row, evaluation_rows, phase_rows, score, trial_rows
+from jaxpomdp.experiments.stopwatch import Stopwatch
 from jaxpomdp.experiments.track import Tracker
 
 if TYPE_CHECKING:
@@ -85,8 +86,10 @@ def run(
         if (path / "summary.json").exists():
             bar.say(f"{path} is complete")
         else:
-            tracker = Tracker(path / "events" if track else None)
-            _Session(config, agent, record, bar, tracker, save_seconds).complete()
+            session = _Session(config, agent, record, bar, save_seconds)
+            session.tracker = Tracker(path / "events" if track else None)
+            with session.watch.counting_compilation():
+                session.complete()
     return path
 
 
@@ -94,23 +97,18 @@ class _Session:
     """A run in one process: the agent's state, how far it is, and the rows since the last commit."""
 
     def __init__(
-        self,
-        config: RunConfig,
-        agent: Any,
-        record: RunDirectory,
-        bar: Progress,
-        tracker: Tracker,
-        save_seconds: float,
+        self, config: RunConfig, agent: Any, record: RunDirectory, bar: Progress, save_seconds: float
     ) -> None:
         self.config, self.agent, self.record = config, agent, record
-        self.bar, self.tracker, self.save_seconds = bar, tracker, save_seconds
+        self.bar, self.tracker, self.save_seconds = bar, Tracker(None), save_seconds
         self.pending: dict[str, list] = {}
         self.recent: deque = deque(maxlen=RECENT_TRIALS)
         fresh = agent.init(np.asarray(config.seeds))
         found = record.restore(fresh)
-        self.state, progress = found or (fresh, {"trial": 0, "seconds": 0.0})
+        self.state, progress = found or (fresh, {"trial": 0, "spent": {}})
         self.trial: int = progress["trial"]
-        self.seconds: float = progress["seconds"]
+        self.watch = Stopwatch(progress["spent"])
+        self.edits = 0
         self.greedy = ""
         self.saved = time.monotonic()
         if record.resumed:
@@ -149,16 +147,18 @@ class _Session:
 
     def _judge(self, state: Any, trial: int, count: int) -> Mapping[str, np.ndarray]:
         key = jax.random.fold_in(jax.random.key(EVALUATION_SEED), trial)
-        return {name: np.asarray(x) for name, x in self.agent.evaluate(state, count, key).items()}
+        with self.watch.measuring("evaluating"):
+            return {name: np.asarray(x) for name, x in self.agent.evaluate(state, count, key).items()}
 
     def _note(self, before: int, trials: Mapping[str, np.ndarray], phase: Mapping[str, np.ndarray]) -> None:
         self.tracker.write("training", self.trial, {**trials, **phase})
         self.recent.extend(np.asarray(trials["success"]).T)
         self._add("trials", trial_rows(self.config.seeds, before, trials))
-        states, evidence = (phase.get(name) for name in ("states_alive", "log_evidence"))
-        if states is not None and evidence is not None:
-            columns = (self.config.seeds, [self.trial] * len(self.config.seeds), states, evidence)
-            self._add("phases", list(zip(*columns, strict=True)))
+        self._add("phases", phase_rows(self.config.seeds, self.trial, phase))
+        self.watch.add_phase(phase)
+        log = getattr(self.agent, "log", [])
+        self._add("edits", [edit_row(self.config.seeds, self.trial, edit) for edit in log[self.edits :]])
+        self.edits = len(log)
 
     def _live(self) -> str:
         percent = 100 * float(np.median(np.mean(np.stack(self.recent), axis=0)))
@@ -168,19 +168,17 @@ class _Session:
         self.pending.setdefault(table, []).extend(rows)
 
     def _commit(self) -> None:
-        now = time.monotonic()
-        self.seconds, self.saved = self.seconds + now - self.saved, now
         pending, self.pending = self.pending, {}
-        self.record.commit(self.state, {"trial": self.trial, "seconds": self.seconds}, pending)
+        self.record.commit(self.state, {"trial": self.trial, "spent": self.watch.total()}, pending)
+        self.saved = time.monotonic()
 
     def _finish(self) -> None:
         final = self.agent.finish(self.state)
         judged = self._judge(final, FINAL, self.config.final_trials)
         summary = {"seeds": list(self.config.seeds), "trials": self.trial}
         summary |= {name: [float(x) for x in values] for name, values in score(judged).items()}
-        seconds = self.seconds + time.monotonic() - self.saved
         rows = trial_rows(self.config.seeds, 0, judged)
-        self.record.finish(final, rows, summary | {"seconds": round(seconds, 1)})
+        self.record.finish(final, rows, summary | {"seconds": self.watch.total()})
 
 
 def _due(before: int, after: int, every: int) -> bool:

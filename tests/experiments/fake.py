@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,8 @@ class FakeConfig:
 class FakeAgent:
     """Trials of up to 20 steps that succeed more and more often."""
 
-    config: FakeConfig = FakeConfig()
+    config: FakeConfig = field(default_factory=FakeConfig)
+    log: list = field(default_factory=list)
 
     def init(self, seeds):
         count = len(seeds)
@@ -47,7 +48,9 @@ class FakeAgent:
             "trial": state["trial"] + count,
             "memory": memory,
         }
-        return state, {**rows, "states_alive": np.full(len(skill), 7), "log_evidence": skill}
+        self.log.append({"seed_index": 0, "phase": state["trial"], "gain": np.float32(skill[0])})
+        once = {"states": np.full(len(skill), 7), "log_evidence": skill, "acting": np.full(len(skill), 0.5)}
+        return state, rows | once
 
     def evaluate(self, state, trials, key):
         return _trials(state, int(jax.random.key_data(key)[-1]), 0, trials)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ from tests.experiments.fake import FakeAgent, build_fake
 CONFIG = RunConfig(
     agent="fake", seeds=(3, 4, 5), trials=23, evaluate_every=10, evaluation_trials=8, final_trials=9
 )
-RESULTS = ("trials.csv", "phases.csv", "evaluations.csv", "final.csv", "model.npz")
+RESULTS = ("trials.csv", "phases.csv", "edits.jsonl", "evaluations.csv", "final.csv", "model.npz")
 
 
 class KilledError(Exception):
@@ -95,8 +96,13 @@ def test_what_is_on_disk_is_what_happened(whole):
     assert data.seeds == [3, 4, 5]
     assert data.trials["steps"].shape == (3, 25)
     assert data.evaluations["trial"].tolist() == [[10, 20]] * 3
-    assert data.phases["states_alive"].shape == (3, 5)
+    assert data.phases["states"].shape == (3, 5)
     summary = record.read_json(whole / "summary.json")
+    assert summary["seconds"]["acting"] == 2.5
+    assert summary["seconds"]["all"] >= summary["seconds"]["evaluating"] > 0
+    edits = [json.loads(line) for line in (whole / "edits.jsonl").read_text().splitlines()]
+    assert [edit["trial"] for edit in edits] == [5, 10, 15, 20, 25]
+    assert {edit["seed"] for edit in edits} == {3}
     np.testing.assert_allclose(summary["goal_percent"], score(data.final)["goal_percent"])
 
 
