@@ -6,11 +6,11 @@ import io
 import json
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 
 from jaxpomdp import cli
+from jaxpomdp.experiments import runner
 from jaxpomdp.experiments.grid import grid, parse_settings
 from jaxpomdp.experiments.record import read_table
 from tests.experiments.fake import FakeAgent, FakeConfig
@@ -18,12 +18,13 @@ from tests.experiments.fake import FakeAgent, FakeConfig
 
 @pytest.fixture(autouse=True)
 def stand_in(monkeypatch):
-    def make_agent(name, world, **overrides):
-        if name != "udhmm":
-            raise ValueError(f"agent must be one of udhmm, got {name!r}")
-        return FakeAgent(replace(FakeConfig(), **overrides))
+    original = runner.named_agent
 
-    monkeypatch.setitem(sys.modules, "jaxpomdp.agents.agent", SimpleNamespace(make_agent=make_agent))
+    def named_agent(name, world, settings):
+        fake = name == "udhmm" and "theta" not in settings
+        return FakeAgent(replace(FakeConfig(), **settings)) if fake else original(name, world, settings)
+
+    monkeypatch.setattr(runner, "named_agent", named_agent)
 
 
 def call(*words):
@@ -59,7 +60,12 @@ def test_the_same_command_resumes_and_another_is_refused(tmp_path, capsys):
 
 def test_mistakes_are_answered_with_the_choices(tmp_path, capsys, monkeypatch):
     assert train(tmp_path / "a", "--agent", "udhm") == 2
-    assert "agent must be one of udhmm" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "agent must be one of" in said
+    assert "perseus" in said
+    assert "did you mean 'udhmm'" in said
+    assert train(tmp_path / "b", "--set", "theta=1", "gamma=0", "thetta=2") == 2
+    assert "setting 'thetta' is unknown" in capsys.readouterr().err
     assert train(tmp_path / "b", "--set", "speed") == 2
     assert "name=value, got 'speed'" in capsys.readouterr().err
     assert call("evaluate", tmp_path / "nothing") == 2
@@ -138,7 +144,7 @@ def test_grids_and_settings_refuse_what_is_not_of_the_form():
 
 
 def test_reproduce_writes_the_files_and_prints_the_table(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(sys.modules["jaxpomdp.agents.agent"], "make_agent", lambda *_, **__: FakeAgent())
+    monkeypatch.setattr(runner, "named_agent", lambda *_: FakeAgent())
     work = ("--out", tmp_path / "results", "--work", tmp_path / "runs")
     assert call("reproduce", "fig-3.9", "--quick", "--progress", "none", *work) == 0
     assert "Figure 3.9" in capsys.readouterr().out

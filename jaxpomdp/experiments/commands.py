@@ -25,7 +25,7 @@ class Train:
     Examples:
       jaxpomdp train --env maze89 --agent udhmm --seeds 5 --trials 300 --out runs/maze
       jaxpomdp train --env tmaze-10 --agent udhmm --set theta=0.4 --trials 1500 --out runs/tmaze
-      jaxpomdp train --env my.POMDP --agent sarsa --out runs/mine
+      jaxpomdp train --env my.POMDP --agent memoryless --out runs/mine
     """
 
     out: Path

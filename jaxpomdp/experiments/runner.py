@@ -48,10 +48,24 @@ def build(config: RunConfig) -> tuple[Any, Any]:
     Raises:
         ValueError: the environment, the agent or a setting is unknown.
     """
-    from jaxpomdp.agents.agent import make_agent
-
     world = load_world(config.env)
-    return world, make_agent(config.agent, world, **dict(config.settings))
+    return world, named_agent(config.agent, world, dict(config.settings))
+
+
+def named_agent(name: str, world: World, settings: Mapping[str, Any]) -> Any:
+    """Return an agent or a reference by name.
+
+    Raises:
+        ValueError: the name or a setting is unknown.
+    """
+    from jaxpomdp.agents import baselines, presets
+
+    if name in baselines.names():
+        return baselines.make(name, world, settings)
+    if name in presets.names():
+        return presets.make(name, world, settings)
+    known = sorted({*presets.names(), *baselines.names()})
+    raise ValueError(f"agent must be one of {', '.join(known)}, got {name!r}{did_you_mean(name, known)}")
 
 
 def run(

@@ -23,16 +23,16 @@ TARGETS: dict[str, Published] = {
 SETTINGS: dict[str, RunConfig | None] = {
     "random walk": maze89.run("random", 0),
     "human": None,
-    "linear Q (seeded)": maze89.run("linear-q"),
-    "SARSA(λ), memoryless": maze89.run("sarsa"),
+    "linear Q (seeded)": maze89.run("seeded-q"),
+    "SARSA(λ), memoryless": maze89.run("memoryless"),
     "RL-LSTM": None,
     "UDHMM, θ = 0.2": maze89.THETA_02,
     "UDHMM, θ = 0": maze89.THETA_0,
     "UDHMM at its best": maze89.BEST,
-    "SARSA(λ), true belief": maze89.run("sarsa-belief"),
+    "SARSA(λ), true belief": maze89.run("belief-sarsa"),
     "Perseus, true model": maze89.run("perseus", 0),
     "QMDP, true model": maze89.run("qmdp", 0),
-    "most likely state, true model": maze89.run("mls", 0),
+    "most likely state, true model": maze89.run("most-likely", 0),
 }
 
 
