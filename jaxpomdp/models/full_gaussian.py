@@ -106,7 +106,6 @@ class FullGaussian:
         dimension = self.mean.shape[-1]
         return jnp.full(self.mean.shape[:1], dimension + dimension * (dimension + 1) // 2)
 
-
     def padded(self, spare: int) -> FullGaussian:
         """Return the channel with rows for ``spare`` more states."""
         cov = estimates.pad_states(self.cov, spare, 0)

@@ -163,5 +163,3 @@ def assert_trees_close(x: Any, y: Any, *, rtol: float = 0.0, atol: float = 1e-5)
         other = dict(jax.tree_util.tree_leaves_with_path(y))[path]
         name = jax.tree_util.keystr(path)
         np.testing.assert_allclose(np.asarray(leaf), np.asarray(other), rtol=rtol, atol=atol, err_msg=name)
-
-

@@ -44,9 +44,7 @@ def step_errors(family, full: bool, columns: int = 2) -> dict[str, float]:
     made, experience = rich_model(columns=columns, full=full), rich_trials()
     expected, evidence = oracle.em_step(made, experience, 0.3, PRIOR)
     config = EMConfig(theta=0.3, prior=PRIOR)
-    params, info = em_step(
-        family, stack(to_params(made, full=full)), stack(to_batch(experience)), config
-    )
+    params, info = em_step(family, stack(to_params(made, full=full)), stack(to_batch(experience)), config)
     vector = params.emissions[1]
     spread = vector.cov if full else vector.var
     wanted = expected["cov"] if full else np.diagonal(expected["cov"], axis1=1, axis2=2)

@@ -35,6 +35,7 @@ def test_the_gradient_is_that_of_the_expected_log_likelihood() -> None:
     params, tapes, prior = to_params(rich_model()), to_batch(rich_trials()), Prior(variance_strength=2.0)
     _, info = em_step(LIGHT, stack(params), stack(tapes), EMConfig(theta=0.3, prior=prior))
     statistics = jax.tree.map(lambda x: x[0], info.statistics)
+
     def expected(free):
         at = FLAT.from_free(params, free, prior)
         return FLAT.expected(at, statistics, 0.3) + FLAT.log_prior(at, statistics, prior, 0.3)
