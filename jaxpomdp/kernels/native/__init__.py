@@ -1,9 +1,9 @@
-"""Kernels in C++ behind JAX's foreign function interface: for the CPU, float32, and only where a compiler is found.
+"""Kernels in C++ behind JAX's foreign function interface: on the CPU, in float32, where a compiler is found.
 
-``available()`` says whether they can be used; the first call compiles them, once per machine (some seconds).
-The other functions work under ``jit``, ``vmap`` and inside loops like any JAX function, but have no derivatives.
+``available()`` says whether they can be used; its first call compiles them, once per machine (some seconds).
+The others work under ``jit``, ``vmap`` and inside loops as any JAX function does, but have no derivatives.
 They use the cores that the process may run on, or as many threads as the environment variable
-``JAXPOMDP_THREADS`` says. ``JAXPOMDP_NATIVE=0`` turns all of it off.
+``JAXPOMDP_THREADS`` says; results do not depend on that. ``JAXPOMDP_NATIVE=0`` turns all of it off.
 
 Shapes: ``S`` models, ``B`` rows, ``T`` steps, ``N`` states, ``A`` actions.
 """
@@ -16,46 +16,47 @@ import jax.numpy as jnp
 from jaxpomdp._types import Array, Posterior
 from jaxpomdp.kernels.native.build import loaded
 
-__all__ = ["available", "estep", "filter_tapes"]
+__all__ = ["available", "estep", "filter_tapes", "sarsa_replay"]
+
+RULES = ("sarsa", "q")
 
 
 def available() -> bool:
-    """Say whether the native kernels can be used here: JAX computes on the CPU and the library compiles."""
+    """Say whether the native kernels can be used here: JAX computes on the CPU, and the library was built."""
     return jax.default_backend() == "cpu" and loaded()
 
 
-def _checked(init: Array, trans: Array, log_obs: Array, actions: Array, start: Array, valid: Array) -> tuple[Array, ...]:
-    """Check shapes and dtypes, since C++ would trust them."""
-    models, states = jnp.shape(init)
-    rows, steps = jnp.shape(log_obs)[1:3]
-    tape = (models, rows, steps)
-    square = (models, jnp.shape(trans)[1], states, states)
-    expected = {
-        "init": (init, (models, states), jnp.float32),
-        "trans": (trans, square, jnp.float32),
-        "log_obs": (log_obs, (*tape, states), jnp.float32),
-        "actions": (actions, tape, jnp.int32),
-        "start": (start, tape, jnp.bool_),
-        "valid": (valid, tape, jnp.bool_),
-    }
-    for name, (value, shape, dtype) in expected.items():
-        check_argument(name, value, shape, dtype)
-    return init, trans, log_obs, actions, start, valid
-
-
-def check_argument(name: str, value: Array, shape: tuple[int, ...], dtype: jnp.dtype) -> None:
-    """Raise if an array has not the shape and dtype that the native kernel will take it to have.
-
-    Raises:
-        ValueError: naming the argument, what was expected and what came.
-    """
+def _check(name: str, value: Array, shape: tuple[int, ...], dtype: type) -> None:
+    """Raise if an array has not the shape and dtype that C++ will take it to have."""
     if jnp.shape(value) != shape or value.dtype != dtype:
         came = f"{value.dtype}{list(jnp.shape(value))}"
         raise ValueError(f"{name} must be {jnp.dtype(dtype).name}{list(shape)}, got {came}")
 
 
+def _check_tapes(
+    init: Array, trans: Array, log_obs: Array, actions: Array, start: Array, valid: Array
+) -> None:
+    """Check the arguments of ``estep`` and ``filter_tapes`` against one another."""
+    if jnp.ndim(log_obs) != 4 or jnp.ndim(trans) != 4:
+        raise ValueError(
+            "log_obs must have shape [S, B, T, N] and trans [S, A, N, N], "
+            f"got {list(jnp.shape(log_obs))} and {list(jnp.shape(trans))}"
+        )
+    models, rows, steps, states = jnp.shape(log_obs)
+    _check("init", init, (models, states), jnp.float32)
+    _check("trans", trans, (models, jnp.shape(trans)[1], states, states), jnp.float32)
+    _check("log_obs", log_obs, (models, rows, steps, states), jnp.float32)
+    _check("actions", actions, (models, rows, steps), jnp.int32)
+    _check("start", start, (models, rows, steps), jnp.bool_)
+    _check("valid", valid, (models, rows, steps), jnp.bool_)
+
+
+def _float32(*shapes: tuple[int, ...]) -> tuple[jax.ShapeDtypeStruct, ...]:
+    return tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
+
+
 def estep(init: Array, trans: Array, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
-    """Smooth all rows of all models: ``kernels.smoothing.smooth`` over rows and models, counts summed over rows.
+    """Smooth all rows of all models: ``kernels.smoothing.smooth`` for each, counts summed over rows.
 
     Args:
         init: probabilities float32 ``[S, N]``.
@@ -66,26 +67,34 @@ def estep(init: Array, trans: Array, log_obs: Array, actions: Array, start: Arra
         valid: bool ``[S, B, T]``, False at padding.
 
     Returns:
-        ``Posterior`` with ``log_evidence[S, B]``, ``gamma[S, B, T, N]``, ``xi[S, A, N, N]``, ``initial[S, N]``.
+        ``Posterior``: ``log_evidence[S, B]``, ``gamma[S, B, T, N]``, ``xi[S, A, N, N]``, ``initial[S, N]``.
 
     Raises:
         ValueError: an argument of another shape or dtype.
 
     Source: Rabiner (1989); thesis section 3.3.
     """
-    arguments = _checked(init, trans, log_obs, actions, start, valid)
-    shapes = (jnp.shape(actions)[:2], jnp.shape(log_obs), jnp.shape(trans), jnp.shape(init))
-    results = tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
-    return Posterior(*jax.ffi.ffi_call("jaxpomdp_estep", results, vmap_method="broadcast_all")(*arguments))
+    _check_tapes(init, trans, log_obs, actions, start, valid)
+    results = _float32(actions.shape[:2], log_obs.shape, trans.shape, init.shape)
+    call = jax.ffi.ffi_call("jaxpomdp_estep", results, vmap_method="broadcast_all")
+    return Posterior(*call(init, trans, log_obs, actions, start, valid))
 
 
 def filter_tapes(
     init: Array, trans: Array, log_obs: Array, actions: Array, start: Array, valid: Array
 ) -> tuple[Array, Array]:
-    """Filter all rows of all models: ``kernels.filtering.filter_tape`` over rows and models.
+    """Filter all rows of all models: ``kernels.filtering.filter_tape`` for each.
+
+    Where the evidence of a step underflows, the row is filtered again in logarithms, so that a state whose
+    probability no float32 holds can come back.
 
     Args:
-        init, trans, log_obs, actions, start, valid: as ``estep``.
+        init: probabilities float32 ``[S, N]``.
+        trans: probabilities float32 ``[S, A, N, N]``.
+        log_obs: float32 ``[S, B, T, N]``.
+        actions: int32 ``[S, B, T]``.
+        start: bool ``[S, B, T]``.
+        valid: bool ``[S, B, T]``.
 
     Returns:
         ``belief[S, B, T, N]`` and ``log_norm[S, B, T]``, both zero at padding.
@@ -93,7 +102,71 @@ def filter_tapes(
     Raises:
         ValueError: an argument of another shape or dtype.
     """
-    arguments = _checked(init, trans, log_obs, actions, start, valid)
-    shapes = (jnp.shape(log_obs), jnp.shape(actions))
-    results = tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
-    return tuple(jax.ffi.ffi_call("jaxpomdp_filter", results, vmap_method="broadcast_all")(*arguments))
+    _check_tapes(init, trans, log_obs, actions, start, valid)
+    results = _float32(log_obs.shape, actions.shape)
+    call = jax.ffi.ffi_call("jaxpomdp_filter", results, vmap_method="broadcast_all")
+    return tuple(call(init, trans, log_obs, actions, start, valid))
+
+
+def sarsa_replay(
+    q: Array,
+    beliefs: Array,
+    actions: Array,
+    rewards: Array,
+    start: Array,
+    valid: Array,
+    terminated: Array,
+    *,
+    alpha: Array | float,
+    gamma: Array | float,
+    lam: Array | float,
+    passes: int = 1,
+    replacing: bool = False,
+    rule: str = "sarsa",
+) -> Array:
+    """Learn again from stored trials: ``kernels.control.replay_tape`` over the rows of each model in turn.
+
+    ``delta_t = r_t + gamma Q(b_{t+1}, a_{t+1}) - Q(b_t, a_t)``, ``e := gamma lambda e``,
+    ``e(., a_t) += b_t``, ``q += alpha delta_t e``. The last step of a trial has no action: its value is 0 if the
+    trial terminated, else ``max_a Q(b, a)``. A start clears the traces.
+
+    Args:
+        q: float32 ``[S, N, A]``, with ``Q(b, a) = sum_i b(i) q(i, a)``.
+        beliefs: float32 ``[S, B, T, N]``.
+        actions: int32 ``[S, B, T]``.
+        rewards: float32 ``[S, B, T]``, paid for ``actions``.
+        start: bool ``[S, B, T]``, first step of a trial.
+        valid: bool ``[S, B, T]``, False at padding.
+        terminated: bool ``[S, B, T]``, the world ended the trial at this step.
+        alpha: learning rate, a scalar or ``[S]``; may be traced, as the next two.
+        gamma: discount.
+        lam: lambda, the decay of the traces besides the discount.
+        passes: how often to go over all rows.
+        replacing: traces take ``max(e, b)`` for the sum (Singh and Sutton, 1996).
+        rule: ``sarsa``, or ``q`` for the maximum over actions at every next step (traces are not cut).
+
+    Returns:
+        The new ``q[S, N, A]``.
+
+    Raises:
+        ValueError: an argument of another shape or dtype, an unknown rule, or a negative number of passes.
+
+    Source: thesis section 3.3; Sutton and Barto (1998), chapter 7.
+    """
+    if rule not in RULES or passes < 0:
+        raise ValueError(f"rule must be one of {RULES} and passes at least 0, got {rule!r} and {passes}")
+    if jnp.ndim(beliefs) != 4 or jnp.ndim(q) != 3:
+        shapes = f"{list(jnp.shape(beliefs))} and {list(jnp.shape(q))}"
+        raise ValueError(f"beliefs must have shape [S, B, T, N] and q [S, N, A], got {shapes}")
+    models, rows, steps, states = jnp.shape(beliefs)
+    _check("q", q, (models, states, jnp.shape(q)[2]), jnp.float32)
+    _check("beliefs", beliefs, (models, rows, steps, states), jnp.float32)
+    _check("actions", actions, (models, rows, steps), jnp.int32)
+    _check("rewards", rewards, (models, rows, steps), jnp.float32)
+    for name, flags in (("start", start), ("valid", valid), ("terminated", terminated)):
+        _check(name, flags, (models, rows, steps), jnp.bool_)
+    per_model = (jnp.broadcast_to(jnp.asarray(x, jnp.float32), (models,)) for x in (alpha, gamma, lam))
+    settings = jnp.stack(tuple(per_model), axis=-1)
+    call = jax.ffi.ffi_call("jaxpomdp_replay", *_float32(q.shape), vmap_method="broadcast_all")
+    flags = {"passes": passes, "replacing": replacing, "greedy": rule == "q"}
+    return call(q, beliefs, actions, rewards, start, valid, terminated, settings, **flags)

@@ -1,7 +1,7 @@
 """Compile the native kernels once per machine, into the user's cache, and load them once per process.
 
-Everything here may fail (no compiler, no headers, a read-only home): then there is no library and callers take
-another route. The reason is logged at level INFO.
+All of it may fail (no compiler, no headers, a home that cannot be written): then there is no library, and
+callers take another route. The reason is logged at level INFO.
 """
 
 from __future__ import annotations
@@ -20,11 +20,16 @@ from pathlib import Path
 import jax
 import jaxlib
 
-SOURCE = Path(__file__).with_name("estep.cc")
-TARGETS = {"jaxpomdp_estep": "JaxpomdpEstep", "jaxpomdp_filter": "JaxpomdpFilter"}
+FOLDER = Path(__file__).parent
+SOURCE = FOLDER / "estep.cc"
+TARGETS = {
+    "jaxpomdp_estep": "JaxpomdpEstep",
+    "jaxpomdp_filter": "JaxpomdpFilter",
+    "jaxpomdp_replay": "JaxpomdpReplay",
+}
 """Names of the custom calls, and the symbols that serve them."""
 
-FLAGS = ("-O3", "-march=native", "-std=c++17", "-ffp-contract=fast", "-fPIC", "-shared", "-pthread")
+FLAGS = ("-O2", "-march=native", "-std=c++17", "-ffp-contract=fast", "-w", "-fPIC", "-shared", "-pthread")
 SECONDS_TO_COMPILE = 300
 _LOG = logging.getLogger(__name__)
 
@@ -40,8 +45,8 @@ def cache_dir() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxpomdp"
 
 
-def _processor() -> str:
-    """Describe the processor: code compiled for one kind must not run on another that shares the home."""
+def processor() -> str:
+    """Describe the processor: what is compiled for one kind must not run on another that shares the home."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -50,17 +55,15 @@ def _processor() -> str:
     return "\n".join([platform.machine(), platform.processor(), *sorted(telling)])
 
 
-def _version(command: str) -> str:
-    return subprocess.run([command, "--version"], capture_output=True, text=True, timeout=60, check=True).stdout
-
-
 def library_path(command: str) -> Path:
-    """Name the library by all that it depends on: source, compiler, flags, jaxlib and processor."""
-    parts = (SOURCE.read_text(), command, _version(command), *FLAGS, jaxlib.__version__, _processor())
+    """Name the library by all that it depends on: sources, compiler, flags, jaxlib and processor."""
+    version = subprocess.run([command, "--version"], capture_output=True, text=True, timeout=60, check=True)
+    sources = [path.read_text() for path in sorted(FOLDER.glob("*.[ch]*"))]
+    parts = (*sources, command, version.stdout, *FLAGS, jaxlib.__version__, processor())
     return cache_dir() / f"native-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:32]}.so"
 
 
-def _compile(command: str, path: Path) -> None:
+def build(command: str, path: Path) -> None:
     """Compile next to ``path``, then rename: other processes see the whole library or none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
@@ -70,13 +73,19 @@ def _compile(command: str, path: Path) -> None:
         made.replace(path)
 
 
-def _load() -> None:
+def load() -> None:
+    """Build the library unless it is there, load it, and register its kernels with JAX.
+
+    Raises:
+        OSError: no compiler, or the library cannot be written or loaded.
+        subprocess.SubprocessError: the compiler failed.
+    """
     command = compiler()
     if command is None:
         raise OSError("no C++ compiler found")
     path = library_path(command)
     if not path.exists():
-        _compile(command, path)
+        build(command, path)
     library = ctypes.CDLL(str(path))
     for name, symbol in TARGETS.items():
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(getattr(library, symbol)), platform="cpu")
@@ -84,12 +93,12 @@ def _load() -> None:
 
 @functools.cache
 def loaded() -> bool:
-    """Compile if needed, load and register the kernels; False if that is turned off or fails. Tried once."""
+    """Say whether the kernels could be built and loaded; False if turned off. Tried once per process."""
     if os.environ.get("JAXPOMDP_NATIVE") == "0":
         return False
     try:
-        _load()
+        load()
     except Exception as error:  # whatever goes wrong, there is another route
-        _LOG.info("no native kernels: %s %s", error, getattr(error, "stderr", "") or "")
+        _LOG.info("no native kernels: %s %s", error, getattr(error, "stderr", None) or "")
         return False
     return True
