@@ -13,10 +13,17 @@ if TYPE_CHECKING:
     from jaxpomdp._types import Chain as Chain
     from jaxpomdp._types import Posterior as Posterior
     from jaxpomdp._types import TrialBatch as TrialBatch
+    from jaxpomdp.agents.agent import Agent as Agent
+    from jaxpomdp.agents.agent import AgentConfig as AgentConfig
+    from jaxpomdp.agents.agent import AgentState as AgentState
+    from jaxpomdp.agents.agent import make_agent as make_agent
+    from jaxpomdp.agents.control import ControlConfig as ControlConfig
+    from jaxpomdp.agents.control import Schedule as Schedule
+    from jaxpomdp.agents.learner import LearnerConfig as LearnerConfig
     from jaxpomdp.agents.planners import PlannerConfig as PlannerConfig
-    from jaxpomdp.agents.planners import Policy as Policy
-    from jaxpomdp.agents.planners import evaluate_policy as evaluate_policy
     from jaxpomdp.agents.planners import plan as plan
+    from jaxpomdp.agents.policies import Policy as Policy
+    from jaxpomdp.agents.policies import evaluate_policy as evaluate_policy
     from jaxpomdp.envs.drawing import draw as draw
     from jaxpomdp.envs.hallway import hallway as hallway
     from jaxpomdp.envs.hallway import hallway_navigation as hallway_navigation
@@ -98,8 +105,12 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Agent": "jaxpomdp.agents.agent",
+    "AgentConfig": "jaxpomdp.agents.agent",
+    "AgentState": "jaxpomdp.agents.agent",
     "Categorical": "jaxpomdp.models.emission",
     "Chain": "jaxpomdp._types",
+    "ControlConfig": "jaxpomdp.agents.control",
     "Decoded": "jaxpomdp.kernels.decoding",
     "DiagonalGaussian": "jaxpomdp.models.emission",
     "EMConfig": "jaxpomdp.models.em",
@@ -111,9 +122,10 @@ _HOMES = {
     "FlatSpec": "jaxpomdp.structure.spec",
     "FullGaussian": "jaxpomdp.models.full_gaussian",
     "GradientConfig": "jaxpomdp.models.gradient",
+    "LearnerConfig": "jaxpomdp.agents.learner",
     "ParsedPOMDP": "jaxpomdp.envs.pomdp_tables",
     "PlannerConfig": "jaxpomdp.agents.planners",
-    "Policy": "jaxpomdp.agents.planners",
+    "Policy": "jaxpomdp.agents.policies",
     "PolicyConfig": "jaxpomdp.structure.policy",
     "Posterior": "jaxpomdp._types",
     "Prior": "jaxpomdp.models.family",
@@ -122,6 +134,7 @@ _HOMES = {
     "ReturnModel": "jaxpomdp.models.emission",
     "RunConfig": "jaxpomdp.experiments.config",
     "RunData": "jaxpomdp.experiments.results",
+    "Schedule": "jaxpomdp.agents.control",
     "SplitConfig": "jaxpomdp.structure.splits",
     "Step": "jaxpomdp.envs.world",
     "TrialBatch": "jaxpomdp._types",
@@ -131,7 +144,7 @@ _HOMES = {
     "draw": "jaxpomdp.envs.drawing",
     "e_step": "jaxpomdp.models.em",
     "em_step": "jaxpomdp.models.em",
-    "evaluate_policy": "jaxpomdp.agents.planners",
+    "evaluate_policy": "jaxpomdp.agents.policies",
     "filter_tape": "jaxpomdp.kernels.filtering",
     "fit": "jaxpomdp.models.em",
     "fit_gradient": "jaxpomdp.models.gradient",
@@ -146,6 +159,7 @@ _HOMES = {
     "load_run": "jaxpomdp.experiments.results",
     "log_evidence": "jaxpomdp.models.selection",
     "make": "jaxpomdp.envs.registry",
+    "make_agent": "jaxpomdp.agents.agent",
     "maze57": "jaxpomdp.envs.maze89",
     "maze89": "jaxpomdp.envs.maze89",
     "model_of": "jaxpomdp.envs.world",

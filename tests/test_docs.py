@@ -29,6 +29,7 @@ def test_docstring_examples(name: str) -> None:
     assert results.failed == 0
 
 
+@pytest.mark.slow
 def test_readme_examples(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each block may use what the blocks before it defined; asserts in them are part of the example."""
     monkeypatch.chdir(tmp_path)
