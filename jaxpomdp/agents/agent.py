@@ -210,7 +210,10 @@ class Agent:
         if not due or not policy.edits_per_phase or (held | (alive.sum(-1) >= policy.node_cap)).all():
             return state, np.zeros(len(held), bool)
         config = learner.em_config(settings)
-        found = learner.gather_evidence(self.family, state.params, batch, jnp.asarray(trial), config, settings.bins)
+        by_trial = settings.split.count == "effective"
+        found = learner.gather_evidence(
+            self.family, state.params, batch, jnp.asarray(trial), config, settings.bins, by_trial
+        )
         arrays = jax.device_get(found)
         specs, origins, rests = packing.unpack_all(state.params), [], []
         for s, spec in enumerate(specs):

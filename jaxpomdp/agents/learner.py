@@ -124,18 +124,22 @@ def select(mask: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, y), yes, no)
 
 
-@partial(jax.jit, static_argnames=("family", "config", "bins"))
+@partial(jax.jit, static_argnames=("family", "config", "bins", "by_trial"))
 def gather_evidence(
-    family: Family, params: Any, batch: TrialBatch, trial: Array, config: EMConfig, bins: int
+    family: Family, params: Any, batch: TrialBatch, trial: Array, config: EMConfig, bins: int, by_trial: bool
 ) -> tuple[Array, ...]:
-    """Gather what the split tests need, on the device: arrays of ``ReturnEvidence`` with leading ``S``."""
+    """Gather what the split tests need, on the device: arrays of ``ReturnEvidence`` with leading ``S``.
+
+    ``by_trial`` counts how many independent trials a state's weight is worth; else every step counts as one.
+    """
     seen = e_step(family, params, batch, config)
     choices = params.returns.mean.shape[-1]
-    return jax.vmap(partial(_evidence_of_model, bins=bins, choices=choices))(seen, batch, trial)
+    over = partial(_evidence_of_model, bins=bins, choices=choices, by_trial=by_trial)
+    return jax.vmap(over)(seen, batch, trial)
 
 
 def _evidence_of_model(
-    seen: Posterior, batch: TrialBatch, trial: Array, *, bins: int, choices: int
+    seen: Posterior, batch: TrialBatch, trial: Array, *, bins: int, choices: int, by_trial: bool
 ) -> tuple[Array, ...]:
     counted = batch.valid & batch.has_return
     returns = jnp.where(counted, batch.returns, 0)
@@ -145,10 +149,19 @@ def _evidence_of_model(
     low, high = jnp.where(empty, 0, low), jnp.where(empty, 1, high)
     edges = jnp.linspace(low, jnp.maximum(high, low + 1e-6 * (1 + jnp.abs(low))), bins + 1)
     hist = return_histogram(seen.gamma, returns, batch.actions, counted, edges, choices)
-    weight, first, second, effective = _moments(seen.gamma, returns, batch.actions, counted, trial, choices)
+    chosen = jax.nn.one_hot(batch.actions if choices > 1 else 0 * batch.actions, choices, dtype=returns.dtype)
+    chosen = (chosen * counted[..., None]).reshape(-1, choices)
+    rows = seen.gamma.reshape(-1, seen.gamma.shape[-1])
+    away = (returns - _mean(returns, counted)).reshape(-1, 1)
+    weight, first, second = (jnp.matmul(rows.T, chosen * x, precision="highest") for x in (1, away, away**2))
     mean = first / jnp.maximum(weight, 1e-30)
     var = jnp.maximum(second / jnp.maximum(weight, 1e-30) - mean**2, 0)
-    return edges, _centres(returns, counted, edges), hist, mean, var, effective
+    effective = _effective(rows, chosen, trial, weight) if by_trial else weight
+    return edges, _centres(returns, counted, edges), hist, mean + _mean(returns, counted), var, effective
+
+
+def _mean(returns: Array, counted: Array) -> Array:
+    return jnp.sum(jnp.where(counted, returns, 0)) / jnp.maximum(jnp.sum(counted), 1)
 
 
 def _centres(returns: Array, counted: Array, edges: Array) -> Array:
@@ -159,19 +172,12 @@ def _centres(returns: Array, counted: Array, edges: Array) -> Array:
     return jnp.where(mass > 0, total / jnp.maximum(mass, 1), (edges[1:] + edges[:-1]) / 2)
 
 
-def _moments(
-    gamma: Array, returns: Array, actions: Array, counted: Array, trial: Array, choices: int
-) -> tuple[Array, ...]:
-    """Return ``[N, K]`` weight, weighted sums of the return and its square, and the effective count."""
-    rows = gamma.reshape(-1, gamma.shape[-1])
-    chosen = jax.nn.one_hot(actions if choices > 1 else jnp.zeros_like(actions), choices, dtype=gamma.dtype)
-    chosen = (chosen * counted[..., None]).reshape(-1, choices)
-    column = returns.reshape(-1, 1)
-    sums = [jnp.matmul(rows.T, chosen * x, precision="highest") for x in (1, column, column**2)]
+def _effective(rows: Array, chosen: Array, trial: Array, weight: Array) -> Array:
+    """Return ``[N, K]``: ``(sum_b W_b)^2 / sum_b W_b^2`` over trials of weight ``W_b``."""
     weights = (rows[:, :, None] * chosen[:, None, :]).reshape(rows.shape[0], -1)
-    by_trial = jax.ops.segment_sum(weights, trial.reshape(-1), num_segments=trial.size // 2)
-    squares = jnp.sum(by_trial**2, axis=0).reshape(sums[0].shape)
-    return (*sums, sums[0] ** 2 / jnp.maximum(squares, 1e-30))
+    each = jax.ops.segment_sum(weights, trial.reshape(-1), num_segments=trial.size // 2)
+    squares = jnp.sum(each**2, axis=0).reshape(weight.shape)
+    return weight**2 / jnp.maximum(squares, 1e-30)
 
 
 def evidence_of_seed(arrays: tuple[np.ndarray, ...], s: int, alive: np.ndarray) -> ReturnEvidence:

@@ -50,8 +50,9 @@ def return_histogram(
         choices: ``K``: 1 (all actions together) or ``A``.
     """
     bins = edges.shape[-1] - 1
-    index = jnp.clip(jnp.searchsorted(edges, returns.reshape(-1), side="right") - 1, 0, bins - 1)
+    place = jnp.clip(jnp.searchsorted(edges, returns.reshape(-1), side="right") - 1, 0, bins - 1)
     choice = actions.reshape(-1) if choices > 1 else 0
-    weights = gamma.reshape(-1, gamma.shape[-1]) * counted.reshape(-1, 1)
-    table = jax.ops.segment_sum(weights, index + bins * choice, num_segments=choices * bins)
-    return table.reshape(choices, bins, -1).transpose(2, 0, 1)
+    cell = jnp.where(counted.reshape(-1), place + bins * choice, -1)
+    one_hot = jax.nn.one_hot(cell, choices * bins, dtype=gamma.dtype)
+    weights = gamma.reshape(-1, gamma.shape[-1])
+    return jnp.matmul(weights.T, one_hot, precision="highest").reshape(-1, choices, bins)
