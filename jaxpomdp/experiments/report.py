@@ -119,7 +119,10 @@ def plot_runs(
     kind = "greedy tests" if greedy else f"mean of {WINDOW} training trials"
     named = list(zip(labels(runs), runs, strict=True))
     panels = []
-    for metric, ylabel in (("goal_percent", "goal %"), ("median_steps" if greedy else "mean_steps", "steps")):
+    for metric, ylabel in (
+        ("goal_percent", "goal %"),
+        ("median_steps" if greedy else "mean_steps", "median steps" if greedy else "steps"),
+    ):
         curves = [course(name, run, metric, greedy) for name, run in named]
         panels.append((f"{ylabel}, {kind}", curves, [lines[metric]] if lines and metric in lines else []))
     return learning_curves(panels, out, title=title or _title(runs), xlabel="training trials")

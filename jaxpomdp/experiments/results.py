@@ -54,8 +54,11 @@ def phase_rows(seeds: Sequence[int], trial: int, phase: Columns) -> list[tuple]:
 
 
 def edit_row(seeds: Sequence[int], trial: int, edit: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a structure edit with the seed and the trial after which it was made."""
-    rest = {name: x for name, x in edit.items() if name != "seed_index"}
+    """Return a structure edit with the seed of its run and the trial after which it was made.
+
+    What the edit itself calls its seed, the one that its parameters were drawn with, is ``draw_seed``.
+    """
+    rest = {"draw_seed" if name == "seed" else name: x for name, x in edit.items() if name != "seed_index"}
     return {"seed": seeds[edit["seed_index"]], "trial": trial} | rest
 
 

@@ -48,7 +48,7 @@ class FakeAgent:
             "trial": state["trial"] + count,
             "memory": memory,
         }
-        self.log.append({"seed_index": 0, "phase": state["trial"], "gain": np.float32(skill[0])})
+        self.log.append({"seed_index": 0, "seed": 99, "phase": state["trial"], "gain": np.float32(skill[0])})
         once = {"states": np.full(len(skill), 7), "log_evidence": skill, "acting": np.full(len(skill), 0.5)}
         return state, rows | once
 

@@ -102,7 +102,7 @@ def test_what_is_on_disk_is_what_happened(whole):
     assert summary["seconds"]["all"] >= summary["seconds"]["evaluating"] > 0
     edits = [json.loads(line) for line in (whole / "edits.jsonl").read_text().splitlines()]
     assert [edit["trial"] for edit in edits] == [5, 10, 15, 20, 25]
-    assert {edit["seed"] for edit in edits} == {3}
+    assert {(edit["seed"], edit["draw_seed"]) for edit in edits} == {(3, 99)}
     np.testing.assert_allclose(summary["goal_percent"], score(data.final)["goal_percent"])
 
 
