@@ -95,7 +95,7 @@ def _exchange(groups: Groups, capacity: int) -> tuple[Array, Array]:
 def capacities(tapes: int, num_actions: int) -> tuple[int, ...]:
     """Return the group capacities to choose from, ascending; the last holds all tapes."""
     some = {4 * -(-int(tapes / num_actions * share) // 4) for share in SHARES}
-    return (*sorted(size for size in some if 0 < size < tapes), tapes)
+    return (*sorted(size for size in some if 0 < size <= 0.7 * tapes), tapes)
 
 
 def _product_at(capacity: int) -> Callable[[Groups, Array, Array], Array]:
@@ -148,8 +148,8 @@ def grouped_counts(groups: Groups, belief: Array, arriving: Array, row_of: Array
     num_actions, states = groups.size.shape[-1], belief.shape[-1]
     step, real, action = _tiles(groups)
     row = _take(row_of, step)
-    left = jnp.where(real[..., None], _take(belief, row), 0)
-    each = jnp.einsum("kri,krj->kij", left, _take(arriving, row), precision=EXACT)
+    left, right = (jnp.where(real[..., None], _take(x, row), 0) for x in (belief, arriving))
+    each = jnp.einsum("kri,krj->kij", left, right, precision=EXACT)
     owner = (action[None, :] == jnp.arange(num_actions)[:, None]).astype(each.dtype)
     total = jnp.matmul(owner, each.reshape(each.shape[0], -1), precision=EXACT)
     return total.reshape(num_actions, states, states)
@@ -242,8 +242,8 @@ def smooth_grouped(
     """Smooth all tapes of all models with renormalised probabilities; arguments as ``posterior.posterior``.
 
     Returns:
-        The posterior, and ``bool[S, B]``: the tape's numbers can be trusted. The counts of a model with a
-        tape that cannot be trusted are worthless; other models do not suffer.
+        The posterior, and ``bool[S, B]``: the tape's numbers can be trusted (no underflow that matters). One
+        that cannot is left out of ``xi`` and ``initial``.
     """
     models, tapes = actions.shape[:2]
     num_actions = chains.log_trans.shape[1]
@@ -255,8 +255,9 @@ def smooth_grouped(
     steps = Steps(*map(_by_time, (weight, first, linked, valid)), groups)
     belief, norm = _forward(jnp.repeat(jnp.exp(chains.log_init), tapes, axis=0), trans, steps)
     last, arriving = _backward(jnp.swapaxes(trans, -1, -2), steps, belief, norm, jnp.zeros_like(log_obs))
-    counts = _count_transitions(belief, arriving, actions, linked, num_actions)
+    trusted = last.trusted.reshape(models, tapes)
+    counts = _count_transitions(belief, arriving, actions, linked & trusted[..., None], num_actions)
     evidence = jnp.sum(jnp.log(norm), axis=0).reshape(models, tapes)
     evidence = evidence + jnp.sum(jnp.where(valid, peak, 0), axis=-1)
-    initial = jnp.sum(last.initial.reshape(models, tapes, -1), axis=1)
-    return Posterior(evidence, last.gamma, trans * counts, initial), last.trusted.reshape(models, tapes)
+    initial = jnp.where(trusted[..., None], last.initial.reshape(models, tapes, -1), 0)
+    return Posterior(evidence, last.gamma, trans * counts, jnp.sum(initial, axis=1)), trusted

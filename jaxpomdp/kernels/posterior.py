@@ -18,7 +18,7 @@ from jax import lax
 from jaxpomdp._types import Array, Chain, Posterior
 from jaxpomdp.kernels import native
 from jaxpomdp.kernels.grouped import smooth_grouped
-from jaxpomdp.kernels.smoothing import smooth
+from jaxpomdp.kernels.smoothing import smooth, smooth_exact
 
 
 def _scan_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:
@@ -29,33 +29,27 @@ def _scan_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, vali
 
 
 def _grouped_plan(chains: Chain, *tapes: Array) -> Posterior:
-    """Smooth in groups; models with a tape that underflowed are done again, tape by tape, by ``smooth``."""
-    scaled, trusted = smooth_grouped(chains, *tapes)
-    return _repair(scaled, ~jnp.all(trusted, axis=1), chains, *tapes)
+    """Smooth in groups, then add the tapes that underflowed, one by one, by ``smooth_exact``."""
+    return _complete(*smooth_grouped(chains, *tapes), chains, *tapes)
 
 
-def _repair(result: Posterior, spoilt: Array, chains: Chain, *tapes: Array) -> Posterior:
-    """Replace the results of the models that are ``spoilt[S]``; a loop that runs no turn when none is."""
-    per_model = result.log_evidence.shape[1]
-    todo = jnp.repeat(spoilt, per_model)
-    order = jnp.argsort(~todo, stable=True)
-    clean = result._replace(
-        xi=jnp.where(spoilt[:, None, None, None], 0, result.xi),
-        initial=jnp.where(spoilt[:, None], 0, result.initial),
-    )
+def _complete(result: Posterior, trusted: Array, chains: Chain, *tapes: Array) -> Posterior:
+    """Add the tapes that the result lacks, where ``trusted[S, B]`` is False; the loop turns once for each."""
+    per_model = trusted.shape[1]
 
-    def redo(carry: tuple[Array, Posterior]) -> tuple[Array, Posterior]:
-        turn, total = carry
-        model, tape = jnp.divmod(order[turn], per_model)
-        one = smooth(jax.tree.map(lambda x: x[model], chains), *(x[model, tape] for x in tapes))
-        return turn + 1, Posterior(
+    def add(carry: tuple[Array, Posterior]) -> tuple[Array, Posterior]:
+        lacking, total = carry
+        index = jnp.argmax(lacking)
+        model, tape = jnp.divmod(index, per_model)
+        one = smooth_exact(jax.tree.map(lambda x: x[model], chains), *(x[model, tape] for x in tapes))
+        return lacking.at[index].set(False), Posterior(
             total.log_evidence.at[model, tape].set(one.log_evidence),
             total.gamma.at[model, tape].set(one.gamma),
             total.xi.at[model].add(one.xi),
             total.initial.at[model].add(one.initial),
         )
 
-    return lax.while_loop(lambda carry: carry[0] < jnp.sum(todo), redo, (jnp.sum(todo) * 0, clean))[1]
+    return lax.while_loop(lambda carry: jnp.any(carry[0]), add, (~trusted.reshape(-1), result))[1]
 
 
 def _native_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Posterior:

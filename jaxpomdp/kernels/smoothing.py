@@ -101,11 +101,6 @@ def smooth_scaled(
     return Posterior(jnp.sum(filtered.log_norm), gamma, xi, initial), jnp.all(trusted[:, 0] | ~valid)
 
 
-def _log_product(log_row: Array, log_matrix: Array) -> Array:
-    """Return ``log(exp(log_row) @ exp(log_matrix))`` by a log-sum-exp per column."""
-    return log_sum_exp(log_row[:, None] + log_matrix, axis=0)
-
-
 def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Filtered:
     """Filter one tape in logarithms: as ``filter_tape``, but belief and prediction come back as logarithms.
 
@@ -120,7 +115,7 @@ def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
         joint = jnp.maximum(predicted + (row - shift), NEG)
         norm = log_sum_exp(joint)
         belief = jnp.where(possible, jnp.where(joint > NEG / 2, joint - norm, NEG), predicted)
-        following = _log_product(belief, chain.log_trans[action])
+        following = log_sum_exp(belief[:, None] + chain.log_trans[action], axis=0)
         return following, Filtered(belief, predicted, jnp.where(possible, norm + shift, NEG))
 
     rows = jnp.where(valid[:, None], log_obs, 0)
@@ -131,20 +126,27 @@ def filter_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
     return Filtered(belief, predicted, jnp.where(valid, log_norm, 0))
 
 
-def _backward_exact(log_trans: Array, rows: Array, actions: Array, linked: Array) -> Array:
-    """Return ``log future[T, N]`` up to a constant per step; as ``backward_weights``, in logarithms.
+def _backward_exact(
+    log_trans: Array, rows: Array, log_belief: Array, actions: Array, linked: Array
+) -> tuple[Array, Array]:
+    """Return ``log future[T, N]`` up to a constant per step, and the expected transitions ``[A, N, N]``.
 
     ``rows[T, N]`` are ``NEG`` in states out of reach, which then do not set the scale for the others.
     """
 
-    def step(following: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
-        row, action, goes_on = inputs
-        beta = jnp.where(row > NEG / 2, _log_product(following, log_trans[action].T), NEG)
+    def step(carry: tuple[Array, Array], inputs: tuple[Array, ...]) -> tuple[tuple[Array, Array], Array]:
+        following, xi = carry
+        row, before, action, goes_on = inputs
+        leads = log_trans[action] + following[None, :]
+        beta = jnp.where(row > NEG / 2, log_sum_exp(leads), NEG)
         beta = jnp.where(goes_on, beta - jnp.max(beta), 0)
         future = jnp.maximum(jnp.where(beta > NEG / 2, row + beta, NEG), NEG)
-        return future, future
+        pair = jnp.where(goes_on, _shares(before[:, None] + leads), 0)
+        return (future, xi.at[action].add(pair)), future
 
-    return lax.scan(step, jnp.zeros_like(rows[0]), (rows, actions, linked), reverse=True)[1]
+    carry = (jnp.zeros_like(rows[0]), jnp.zeros_like(log_trans))
+    (_, xi), future = lax.scan(step, carry, (rows, log_belief, actions, linked), reverse=True)
+    return future, xi
 
 
 def _heeded_rows(predicted: Array, log_obs: Array) -> Array:
@@ -170,16 +172,8 @@ def smooth_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
     linked = linked_steps(start, valid)
     filtered = filter_exact(chain, log_obs, actions, start, valid)
     rows = _heeded_rows(filtered.predicted, log_obs)
-    future = _backward_exact(chain.log_trans, rows, actions, linked)
+    future, xi = _backward_exact(chain.log_trans, rows, filtered.belief, actions, linked)
     gamma = jax.vmap(_shares)(filtered.predicted + future)
-
-    def count(xi: Array, inputs: tuple[Array, ...]) -> tuple[Array, None]:
-        belief, arriving, action, goes_on = inputs
-        pair = _shares(belief[:, None] + chain.log_trans[action] + arriving[None, :])
-        return xi.at[action].add(jnp.where(goes_on, pair, 0)), None
-
-    steps = (filtered.belief, jnp.roll(future, -1, axis=0), actions, linked)
-    xi, _ = lax.scan(count, jnp.zeros_like(chain.log_trans), steps)
     initial = jnp.sum(jnp.where(trial_starts(start, valid)[:, None], gamma, 0), axis=0)
     return Posterior(jnp.sum(filtered.log_norm), gamma, xi, initial)
 
