@@ -10,7 +10,7 @@
 ``actions[t]`` drives ``s[t] -> s[t+1]``; at the last step of a trial it drives nothing and is ignored.
 
 Letters, in docstrings and shapes: ``S`` seeds (models), ``B`` rows of trials, ``T`` steps, ``N`` states
-(production states), ``M`` tree nodes, ``A`` actions, ``O`` discrete observations, ``D`` observation dimensions.
+(production states), ``M`` tree nodes, ``A`` actions, ``O`` discrete observations, ``D`` dimensions of one.
 
 A row of a batch is a *tape*: one trial, or several laid end to end. ``start`` marks the first step of each;
 a start forgets the past, so a tape of many short trials costs what its steps cost and no padding.
@@ -63,7 +63,7 @@ class TrialBatch:
         returns: float ``[..., T]``, discounted return from each step on.
         valid: bool ``[..., T]``, the step exists (False = padding; it contributes nothing, exactly).
         start: bool ``[..., T]``, the step is the first of a trial.
-        terminated: bool ``[..., T]``, the world ended the trial at this step (else its last step was cut off).
+        terminated: bool ``[..., T]``, the world ended the trial at this step (else it was cut off).
         observed: bool ``[..., T]``, the observation is there (False = missing step).
         has_return: bool ``[..., T]``, the return is modelled at this step.
     """
@@ -80,7 +80,7 @@ class TrialBatch:
 
 
 def last_steps(valid: Array, start: Array) -> Array:
-    """Mark the last step of every trial, ``bool[..., T]``: the next step is a start, padding, or beyond the tape."""
+    """Mark the last step of every trial, ``bool[..., T]``: what follows is a start, padding or nothing."""
     beyond = jnp.ones_like(start[..., :1])
     following = jnp.concatenate([start[..., 1:] | ~valid[..., 1:], beyond], axis=-1)
     return valid & following

@@ -40,7 +40,7 @@ def normalise(x: Array, fallback: Array, axis: int = -1) -> Array:
 
 
 def bucket(size: int, *, cap: int | None = None, step: float = 1.5, least: int = 8) -> int:
-    """Return the smallest capacity that holds ``size``: ``least``, then growing by ``step``, never over ``cap``.
+    """Return the smallest capacity that holds ``size``: ``least``, then growing by ``step``, at most ``cap``.
 
     Shapes drawn from few capacities make a whole run compile each kernel a handful of times.
 

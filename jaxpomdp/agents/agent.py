@@ -22,7 +22,7 @@ from jaxpomdp.agents import experience, learner
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.experience import Experience
 from jaxpomdp.agents.learner import LearnerConfig
-from jaxpomdp.agents.trial import Actor, Log, run_trials
+from jaxpomdp.agents.trial import Actor, run_trials
 from jaxpomdp.envs.world import World
 from jaxpomdp.models import init as starts
 from jaxpomdp.models.family import Family
@@ -97,7 +97,9 @@ class Agent:
         """
         seeds = np.asarray(seeds, np.int64)
         params, q = self._start(seeds)
-        keys = jax.vmap(lambda seed: jax.random.key_data(jax.random.key(seed)))(jnp.asarray(seeds, jnp.uint32))
+        keys = jax.vmap(lambda seed: jax.random.key_data(jax.random.key(seed)))(
+            jnp.asarray(seeds, jnp.uint32)
+        )
         zero = jnp.zeros(len(seeds), jnp.int32)
         window = self.config.learner.window if self.config.learner else 1
         store = experience.no_experience(len(seeds), window, (np.int32(0),))
@@ -130,7 +132,7 @@ class Agent:
         """Do one round: a phase of trials, then what is learned from them.
 
         Returns:
-            The new state, and rows: ``steps``, ``reward``, ``discounted``, ``success`` of shape ``[S, trials]``;
+            The new state, and rows: ``steps``, ``reward``, ``discounted``, ``success``, ``[S, trials]`` each;
             per seed ``states``, ``log_evidence``, ``epsilon`` and seconds spent ``acting``, ``fitting``,
             ``structure``, ``replaying`` (the same for all seeds).
         """
@@ -167,7 +169,9 @@ class Agent:
         average = np.where(np.isnan(recent).any(axis=1), -np.inf, np.mean(np.nan_to_num(recent), axis=1))
         better = average > state.best.score
         score = np.where(better, average, state.best.score)
-        best = learner.select(jnp.asarray(better), (state.params, state.actor.q), (state.best.params, state.best.q))
+        best = learner.select(
+            jnp.asarray(better), (state.params, state.actor.q), (state.best.params, state.best.q)
+        )
         return state._replace(recent=recent, best=Best(*best, score))
 
     def _learn(self, state: AgentState, clock: _Clock) -> tuple[AgentState, np.ndarray]:
@@ -192,11 +196,13 @@ class Agent:
         return self._replay(state, batch, clock), evidence
 
     def _held(self, state: AgentState) -> np.ndarray:
-        """Say which seeds do well enough to leave their model alone: ``std / |mean|`` of start returns is low."""
+        """Say which seeds do too well to touch their model: ``std / |mean|`` of start returns is low."""
         settings = self.config.learner
         if not settings.gate:
             return np.zeros(len(state.recent), bool)
-        latest = experience.start_returns(state.experience, settings.return_gamma, latest=settings.gate_trials)
+        latest = experience.start_returns(
+            state.experience, settings.return_gamma, latest=settings.gate_trials
+        )
         return np.array([len(r) > 1 and r.mean() > 0 and r.std() < settings.gate * r.mean() for r in latest])
 
     def _split(
@@ -264,12 +270,14 @@ class Agent:
         if not settings.replay_passes:
             return state
         lam = control.lam if settings.replay_lam is None else settings.replay_lam
-        q = learner.replay(self.family, state.params, batch, state.actor.q, control, settings.replay_passes, lam)
+        q = learner.replay(
+            self.family, state.params, batch, state.actor.q, control, settings.replay_passes, lam
+        )
         clock.lap("replaying", after=q)
         return state._replace(actor=replace(state.actor, q=q))
 
     def evaluate(self, state: AgentState, trials: int, key: Array) -> dict[str, np.ndarray]:
-        """Act greedily without learning: ``steps``, ``reward``, ``discounted``, ``success``, each ``[S, trials]``.
+        """Act greedily, without learning: ``steps``, ``reward``, ``discounted`` and ``success``, ``[S, trials]``.
 
         Args:
             state: the agent.
@@ -310,7 +318,7 @@ class _Clock:
 
 
 def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.ndarray]:
-    """Return what each trial came to: ``steps``, ``reward``, ``discounted`` and ``success``, ``[S, trials]``."""
+    """Return what trials came to: ``steps``, ``reward``, ``discounted``, ``success``, ``[S, trials]``."""
     rows = [_summary(seed, world) for seed in trials]
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 

@@ -43,7 +43,9 @@ class Schedule:
         if self.steps < 1:
             raise ValueError(f"steps must be at least 1, got {self.steps}")
         if self.kind == "exponential" and not (self.start > 0 and self.end > 0):
-            raise ValueError(f"an exponential schedule needs start and end above 0, got {self.start}, {self.end}")
+            raise ValueError(
+                f"an exponential schedule needs start and end above 0, got {self.start}, {self.end}"
+            )
 
     def function(self) -> Callable[[Array], Array]:
         """Return the schedule as an optax function of the step count."""
@@ -127,7 +129,9 @@ class Lane(NamedTuple):
     steps: Array
 
 
-def choose(config: ControlConfig, values: Array, last: Array, steps: Array, uniforms: Array) -> tuple[Array, Array]:
+def choose(
+    config: ControlConfig, values: Array, last: Array, steps: Array, uniforms: Array
+) -> tuple[Array, Array]:
     """Choose an action: ``(action, explored)`` from values ``[A]`` and three uniform numbers."""
     level = config.schedule.function()(steps)
     if config.exploration == "boltzmann":

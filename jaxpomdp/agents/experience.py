@@ -134,7 +134,9 @@ def tapes_of(store: Experience, *, least: int = 256) -> Tapes:
     longest = int(store.lengths.max(initial=1))
     width = bucket(longest, least=least, step=2.0)
     places = [_places(lengths[lengths > 0], width) for lengths in store.lengths]
-    rows = bucket(max(int(where[-1]) // width + 1 if len(where) else 1 for where in places), least=8, step=1.25)
+    rows = bucket(
+        max(int(where[-1]) // width + 1 if len(where) else 1 for where in places), least=8, step=1.25
+    )
     return _laid(store, places, rows, width)
 
 

@@ -77,7 +77,14 @@ class LearnerConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers and names that mean nothing."""
-        least = {"states": 1, "window": 1, "trials_per_phase": 1, "em_iterations": 0, "replay_passes": 0, "bins": 4}
+        least = {
+            "states": 1,
+            "window": 1,
+            "trials_per_phase": 1,
+            "em_iterations": 0,
+            "replay_passes": 0,
+            "bins": 4,
+        }
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
@@ -184,14 +191,16 @@ def evidence_of_seed(arrays: tuple[np.ndarray, ...], s: int, alive: np.ndarray) 
     """Return the evidence of one seed, without its spare slots."""
     edges, centres, hist, mean, var, effective = (np.asarray(x[s], np.float64) for x in arrays)
     kept = np.flatnonzero(alive)
-    return ReturnEvidence(np.maximum.accumulate(edges), centres, *(x[kept] for x in (hist, mean, var, effective)))
+    return ReturnEvidence(
+        np.maximum.accumulate(edges), centres, *(x[kept] for x in (hist, mean, var, effective))
+    )
 
 
 @partial(jax.jit, static_argnames=("family", "config", "passes", "lam"))
 def replay(
     family: Family, params: Any, batch: TrialBatch, q: Array, config: ControlConfig, passes: int, lam: float
 ) -> Array:
-    """Learn values once more from stored tapes, through the beliefs of the model as it is now: ``q[S, N, A]``."""
+    """Learn values once more from stored tapes, by the beliefs of the model as it is now: ``q[S, N, A]``."""
     beliefs = filter_batch(family, params, batch)
     if native.available() and not config.replacing and config.rule == "sarsa":
         return native.sarsa_replay(

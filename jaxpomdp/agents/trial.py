@@ -88,7 +88,7 @@ def next_belief(
 
 
 def _draws(keys: Array, first: Array, trials: int, limit: int) -> Array:
-    """Return uniforms ``[S, trials + 1, limit + 1, u]`` of each (seed, trial, step); row 0 is for the reset."""
+    """Return uniforms ``[S, trials + 1, limit + 1, u]`` of (seed, trial, step); row 0 is for the reset."""
     numbers = first[:, None] + jnp.arange(trials + 1)[None, :]
     of_trial = jax.vmap(jax.vmap(jax.random.fold_in, in_axes=(None, 0)))(keys, numbers)
     return jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (limit + 1, _DRAWS))))(of_trial)
@@ -131,7 +131,14 @@ def _advance(
         jnp.where(active, rate, 0),
     )
     log = Log(
-        seed.observation, lane.action, out.reward, out.observation, active, ended & active, out.terminated, best
+        seed.observation,
+        lane.action,
+        out.reward,
+        out.observation,
+        active,
+        ended & active,
+        out.terminated,
+        best,
     )
     learned = learned._replace(steps=jnp.where(active, learned.steps, lane.steps))
     onward = _Seed(learned, out.state, out.observation, seed.trial, seed.t + 1)

@@ -60,7 +60,7 @@ def mark(trace: Array, belief: Array, action: Array, decay: Array, *, replacing:
 
 
 class ReplayData(NamedTuple):
-    """A tape to learn values from again: ``beliefs[T, N]``, ``actions``, ``rewards`` and flags, each ``[T]``."""
+    """A tape to learn values from again: ``beliefs[T, N]``; ``actions``, ``rewards``, flags ``[T]``."""
 
     beliefs: Array
     actions: Array
@@ -82,18 +82,27 @@ class _Links(NamedTuple):
 
 def _links(data: ReplayData) -> _Links:
     last = last_steps(data.valid, data.start)
-    following = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), (last, data.terminated, data.beliefs, data.actions))
+    following = jax.tree.map(
+        lambda x: jnp.roll(x, -1, axis=0), (last, data.terminated, data.beliefs, data.actions)
+    )
     last_tp1, terminated_tp1, beliefs_tp1, actions_tp1 = following
     return _Links(data.valid & ~last, last_tp1, terminated_tp1, beliefs_tp1, actions_tp1)
 
 
 def replay_tape(
-    q: Array, data: ReplayData, alpha: Array, gamma: Array, lam: Array, *, replacing: bool = False, rule: str = "sarsa"
+    q: Array,
+    data: ReplayData,
+    alpha: Array,
+    gamma: Array,
+    lam: Array,
+    *,
+    replacing: bool = False,
+    rule: str = "sarsa",
 ) -> Array:
     """Learn once more from a tape, in its order, by SARSA(lambda) or Q(lambda) on given beliefs.
 
     ``delta_t = r_t + gamma Q(b_{t+1}, a_{t+1}) - Q(b_t, a_t)``; ``e_t`` as in :func:`mark`;
-    ``q := q + alpha delta_t e_t``. At the last step of a trial there is no action: its value is 0 if the trial
+    ``q := q + alpha delta_t e_t``. At the last step of a trial there is no action: its value is 0 if it
     terminated, else ``max_a Q(b, a)``. Q(lambda) always takes the maximum; its traces are not cut.
 
     Args:
