@@ -33,14 +33,22 @@ def exact_random_walk(world, actions):
     return 100 * belief[np.asarray(model.terminal)].sum()
 
 
-@pytest.mark.parametrize(("name", "actions"), [("random", [1, 2, 3, 4]), ("random-all", [0, 1, 2, 3, 4])])
-def test_random_walks_reach_the_goal_as_often_as_computed(name, actions):
+def check_random_walk(name, actions):
     world = maze89()
     agent = baselines.make(name, world, {})
-    state = agent.init([3, 4])
-    assert goal_percent(agent, state, trials=1500) == pytest.approx(
-        exact_random_walk(world, actions), abs=2.5
-    )
+    found = goal_percent(agent, agent.init([3, 4]), trials=1500)
+    assert found == pytest.approx(exact_random_walk(world, actions), abs=2.5)
+
+
+def test_a_random_walk_without_no_op_reaches_the_goal_as_often_as_computed():
+    check_random_walk("random", [1, 2, 3, 4])
+
+
+@pytest.mark.slow
+def test_a_random_walk_of_all_actions_reaches_the_goal_as_often_as_computed():
+    check_random_walk("random-all", [0, 1, 2, 3, 4])
+    with pytest.raises(AssertionError):
+        check_random_walk("random-all", [1, 2, 3, 4])
 
 
 def test_a_fixed_agent_goes_on_where_it_stopped_and_repeats_itself():
@@ -55,8 +63,8 @@ def test_a_fixed_agent_goes_on_where_it_stopped_and_repeats_itself():
     assert (first["steps"] != second["steps"]).any()
     assert (first["steps"][0] != first["steps"][1]).any()
     np.testing.assert_array_equal(later.trials, [5, 5])
-    alone = agent.run(agent.init([2]))[1]
-    np.testing.assert_array_equal(alone["steps"][0], first["steps"][1])
+    in_other_company = agent.run(agent.init([2, 9]))[1]
+    np.testing.assert_array_equal(in_other_company["steps"][0], first["steps"][1])
 
 
 def test_seeds_take_plans_in_turn():
@@ -64,7 +72,6 @@ def test_seeds_take_plans_in_turn():
     state = agent.init([5, 6, 7])
     assert state.policy.vectors.shape[0] == 3
     np.testing.assert_array_equal(state.policy.vectors[0], state.policy.vectors[2])
-    assert goal_percent(agent, state, trials=20) == 100
 
 
 def test_without_memory_the_belief_is_the_last_observation():
@@ -95,7 +102,6 @@ def test_seeded_values_are_qmdp():
     )
     np.testing.assert_allclose(state.actor.q[0], q.T, atol=1e-6)
     assert agent.config.control.gamma == world.discount
-    assert goal_percent(agent, state, trials=20) == 100
 
 
 def test_a_world_whose_observations_belong_to_actions_is_refused(shared_dir):
