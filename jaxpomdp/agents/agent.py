@@ -277,7 +277,7 @@ class Agent:
         return state._replace(actor=replace(state.actor, q=q))
 
     def evaluate(self, state: AgentState, trials: int, key: Array) -> dict[str, np.ndarray]:
-        """Act greedily, without learning: ``steps``, ``reward``, ``discounted`` and ``success``, ``[S, trials]``.
+        """Act greedily, not learning: ``steps``, ``reward``, ``discounted`` and ``success`` ``[S, trials]``.
 
         Args:
             state: the agent.
