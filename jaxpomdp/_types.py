@@ -19,15 +19,17 @@ a start forgets the past, so a tape of many short trials costs what its steps co
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
 
 Array = jax.Array
+Class = TypeVar("Class")
 
 
-def pytree(cls: type) -> type:
+@dataclass_transform(frozen_default=True)
+def pytree(cls: type[Class]) -> type[Class]:
     """Make a class a frozen dataclass whose fields are pytree children."""
     return jax.tree_util.register_dataclass(dataclass(frozen=True)(cls))
 

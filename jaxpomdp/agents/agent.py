@@ -172,7 +172,7 @@ class Agent:
         best = learner.select(
             jnp.asarray(better), (state.params, state.actor.q), (state.best.params, state.best.q)
         )
-        return state._replace(recent=recent, best=Best(*best, score))
+        return state._replace(recent=recent, best=Best(best[0], best[1], score))
 
     def _learn(self, state: AgentState, clock: _Clock) -> tuple[AgentState, np.ndarray]:
         settings = self.config.learner
@@ -349,9 +349,9 @@ def with_settings(config: Any, settings: Mapping[str, Any]) -> Any:
 
 
 def _with(config: Any, path: tuple[str, ...], value: Any) -> Any:
-    if len(path) > 1:
-        value = _with(getattr(config, path[0]), path[1:], value)
-    return replace(config, **{path[0]: value})
+    head, *rest = path
+    inner = _with(getattr(config, head), tuple(rest), value) if rest else value
+    return replace(config, **{head: inner})
 
 
 def _path(config: Any, name: str) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ class Schedule:
                 f"an exponential schedule needs start and end above 0, got {self.start}, {self.end}"
             )
 
-    def function(self) -> Callable[[Array], Array]:
+    def function(self) -> Callable[[Array], Any]:
         """Return the schedule as an optax function of the step count."""
         import optax
 

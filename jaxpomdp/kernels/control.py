@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -118,7 +118,7 @@ def replay_tape(
         The new ``q[N, A]``.
     """
 
-    def step(carry: tuple[Array, Array], inputs: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+    def step(carry: tuple[Array, Array], inputs: tuple[Any, ...]) -> tuple[tuple[Array, Array], None]:
         value, trace = carry
         belief, action, reward, first, link = inputs
         values_tp1 = action_values(value, link.beliefs_tp1)

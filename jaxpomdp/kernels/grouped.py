@@ -164,14 +164,14 @@ def _count_transitions(
     """
     models, tapes, steps = actions.shape
     flat = belief.reshape(-1, belief.shape[-1]), arriving.reshape(-1, belief.shape[-1])
-    by_time = [x.transpose(0, 2, 1).reshape(models, -1) for x in (actions, linked)]
+    acts, links = (x.transpose(0, 2, 1).reshape(models, -1) for x in (actions, linked))
     inside = (jnp.arange(steps) * models * tapes)[:, None] + jnp.arange(tapes)[None, :]
 
     def count(inputs: tuple[Groups, Array]) -> Array:
         groups, model = inputs
         return grouped_counts(groups, *flat, (inside + model * tapes).reshape(-1))
 
-    return lax.map(count, (group_rows(*by_time, num_actions), jnp.arange(models)))
+    return lax.map(count, (group_rows(acts, links, num_actions), jnp.arange(models)))
 
 
 def _by_time(x: Array) -> Array:
@@ -251,8 +251,8 @@ def smooth_grouped(
     first, linked = trial_starts(start, valid), linked_steps(start, valid)
     peak = jnp.maximum(jnp.max(log_obs, axis=-1), NEG)
     weight = jnp.where(valid[..., None], jnp.exp(log_obs - peak[..., None]), 1)
-    groups = group_rows(*(jnp.moveaxis(x, 2, 0) for x in (actions, linked)), num_actions)
-    steps = Steps(*map(_by_time, (weight, first, linked, valid)), groups)
+    groups = group_rows(jnp.moveaxis(actions, 2, 0), jnp.moveaxis(linked, 2, 0), num_actions)
+    steps = Steps(_by_time(weight), _by_time(first), _by_time(linked), _by_time(valid), groups)
     belief, norm = _forward(jnp.repeat(jnp.exp(chains.log_init), tapes, axis=0), trans, steps)
     last, arriving = _backward(jnp.swapaxes(trans, -1, -2), steps, belief, norm, jnp.zeros_like(log_obs))
     trusted = last.trusted.reshape(models, tapes)

@@ -105,7 +105,8 @@ def filter_tapes(
     _check_tapes(init, trans, log_obs, actions, start, valid)
     results = _float32(log_obs.shape, actions.shape)
     call = jax.ffi.ffi_call("jaxpomdp_filter", results, vmap_method="broadcast_all")
-    return tuple(call(init, trans, log_obs, actions, start, valid))
+    belief, log_norm = call(init, trans, log_obs, actions, start, valid)
+    return belief, log_norm
 
 
 def sarsa_replay(
@@ -127,8 +128,8 @@ def sarsa_replay(
     """Learn again from stored trials: ``kernels.control.replay_tape`` over the rows of each model in turn.
 
     ``delta_t = r_t + gamma Q(b_{t+1}, a_{t+1}) - Q(b_t, a_t)``, ``e := gamma lambda e``,
-    ``e(., a_t) += b_t``, ``q += alpha delta_t e``. The last step of a trial has no action: its value is 0 if the
-    trial terminated, else ``max_a Q(b, a)``. A start clears the traces.
+    ``e(., a_t) += b_t``, ``q += alpha delta_t e``. The last step of a trial has no action: its value is 0 if
+    it terminated, else ``max_a Q(b, a)``. A start clears the traces.
 
     Args:
         q: float32 ``[S, N, A]``, with ``Q(b, a) = sum_i b(i) q(i, a)``.

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import hashlib
+import importlib.metadata
 import logging
 import os
 import platform
@@ -18,7 +19,6 @@ import tempfile
 from pathlib import Path
 
 import jax
-import jaxlib
 
 FOLDER = Path(__file__).parent
 SOURCE = FOLDER / "estep.cc"
@@ -59,7 +59,7 @@ def library_path(command: str) -> Path:
     """Name the library by all that it depends on: sources, compiler, flags, jaxlib and processor."""
     version = subprocess.run([command, "--version"], capture_output=True, text=True, timeout=60, check=True)
     sources = [path.read_text() for path in sorted(FOLDER.glob("*.[ch]*"))]
-    parts = (*sources, command, version.stdout, *FLAGS, jaxlib.__version__, processor())
+    parts = (*sources, command, version.stdout, *FLAGS, importlib.metadata.version("jaxlib"), processor())
     return cache_dir() / f"native-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:32]}.so"
 
 
