@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxpomdp.envs.build import Tables, assemble
+from jaxpomdp.envs.pomdp_file import read_pomdp
 from jaxpomdp.envs.pomdp_rows import scaled
 from jaxpomdp.envs.pomdp_tables import ANY, ParsedPOMDP, RewardRules
+from jaxpomdp.envs.pomdpx import read_pomdpx
 from jaxpomdp.envs.world import World, model_of
 
 FIRST_SYMBOL = "nothing-yet"
@@ -69,6 +73,22 @@ def from_pomdp(
         action_names=parsed.actions,
         observation_names=parsed.observations + extra,
     )
+
+
+def read_world(path: str | Path, **settings: Any) -> World:
+    """Return the world of a .POMDP or .pomdpx file, named after the file.
+
+    Args:
+        path: ends in ``.pomdpx`` for that format; anything else is read as .POMDP.
+        **settings: of :func:`from_pomdp`; here ``goal_states`` is ``"reset"`` unless given.
+
+    Raises:
+        PomdpError: the file cannot be read.
+        ValueError: it cannot be cut into trials as asked.
+    """
+    path = Path(path)
+    parsed = read_pomdpx(path) if path.suffix.lower() == ".pomdpx" else read_pomdp(path)
+    return from_pomdp(parsed, **{"goal_states": "reset", "name": path.stem, **settings})
 
 
 def reset_states(parsed: ParsedPOMDP) -> np.ndarray:

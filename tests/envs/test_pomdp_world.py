@@ -8,7 +8,7 @@ import pytest
 
 from jaxpomdp.envs.maze89 import maze57, maze89
 from jaxpomdp.envs.pomdp_file import read_pomdp, write_pomdp
-from jaxpomdp.envs.pomdp_world import FIRST_SYMBOL, from_pomdp, reset_states, to_pomdp
+from jaxpomdp.envs.pomdp_world import FIRST_SYMBOL, from_pomdp, read_world, reset_states, to_pomdp
 from jaxpomdp.envs.world import model_of, reset_key, step_key
 
 TEXT = """discount: 0.9
@@ -84,6 +84,23 @@ def test_a_symbol_for_the_first_observation_where_observations_belong_to_actions
 def test_refusals(text, settings, message):
     with pytest.raises(ValueError, match=message):
         from_pomdp(read_pomdp(text), **settings)
+
+
+@pytest.mark.parametrize(
+    ("file", "terminal"),
+    [
+        ("hallway2.POMDP", 4),
+        ("cheese.95.POMDP", 1),
+        ("tiger.95.POMDP", 0),
+        ("gym-pomdps/heavenhell_2.pomdp", 4),
+        ("pobax/tiger-alt-start.POMDP", 1),
+        ("pomdpx/Hallway.pomdpx", 4),
+    ],
+)
+def test_files_become_worlds_that_end_where_they_start_again(shared_dir, file, terminal):
+    world = read_world(shared_dir / "data/pomdp" / file)
+    assert int(world.terminal.sum()) == terminal
+    assert world.name == file.rpartition("/")[2].rpartition(".")[0]
 
 
 def test_a_world_written_and_read_is_the_same_world():
