@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array
-from jaxpomdp.agents.agent import Agent, AgentConfig, with_settings
+from jaxpomdp.agents.agent import Agent, AgentConfig
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.planners import PERSEUS, PlannerConfig, plan
 from jaxpomdp.agents.policies import Policy, rollouts
+from jaxpomdp.agents.settings import with_settings
 from jaxpomdp.envs.world import TrueModel, World, model_of
 from jaxpomdp.kernels import planning
 from jaxpomdp.models.emission import Categorical, ReturnModel

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from jaxpomdp.agents.agent import Agent, AgentConfig, with_settings
+from jaxpomdp.agents.agent import Agent, AgentConfig
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.learner import LearnerConfig
+from jaxpomdp.agents.settings import with_settings
 from jaxpomdp.envs.world import World
 from jaxpomdp.structure.policy import PolicyConfig
 from jaxpomdp.structure.splits import SplitConfig
