@@ -157,6 +157,7 @@ def test_demo_shows_a_table_and_draws(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "thesis: UDHMM" in said
     assert "here: UDHMM, 200 trials, median of 2 seeds" in said
+    assert "the median agent is past the best policy without memory" in said
     assert (tmp_path / "figures" / "learning.png").stat().st_size > 10_000
 
 

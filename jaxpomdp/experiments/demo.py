@@ -34,7 +34,9 @@ def demo(config: RunConfig, out: Path, *, progress: str = "auto", make: Build = 
     lines = {"goal_percent": Line("thesis 92", 92), "median_steps": Line("thesis 62", 62)}
     title = f"UDHMM learning the 89-state maze, {len(config.seeds)} seeds"
     picture = plot_runs([out], out / "figures" / "learning.png", title, lines)
-    return f"\n{comparison_table(data)}\n\n{data.seconds:.0f} s. Picture: {picture}"
+    past = "past" if is_past_memoryless(data) else "not yet past"
+    verdict = f"In {data.seconds:.0f} s the median agent is {past} the best policy without memory."
+    return f"\n{comparison_table(data)}\n\n{verdict}\nPicture: {picture}"
 
 
 def comparison_table(data: RunData) -> str:
