@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jaxpomdp.agents.agent import make_agent as make_agent
     from jaxpomdp.agents.control import ControlConfig as ControlConfig
     from jaxpomdp.agents.control import Schedule as Schedule
+    from jaxpomdp.agents.gym_agent import GymAgent as GymAgent
     from jaxpomdp.agents.learner import LearnerConfig as LearnerConfig
     from jaxpomdp.agents.planners import PlannerConfig as PlannerConfig
     from jaxpomdp.agents.planners import plan as plan
@@ -122,6 +123,7 @@ _HOMES = {
     "FlatSpec": "jaxpomdp.structure.spec",
     "FullGaussian": "jaxpomdp.models.full_gaussian",
     "GradientConfig": "jaxpomdp.models.gradient",
+    "GymAgent": "jaxpomdp.agents.gym_agent",
     "LearnerConfig": "jaxpomdp.agents.learner",
     "ParsedPOMDP": "jaxpomdp.envs.pomdp_tables",
     "PlannerConfig": "jaxpomdp.agents.planners",
