@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -10,6 +11,9 @@ import numpy as np
 
 from jaxpomdp._types import Chain
 from jaxpomdp.numerics import NEG
+
+quick_jit = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+"""Compile in half the time: for small tests, where that is what takes long."""
 
 
 class Problem(NamedTuple):

@@ -9,11 +9,12 @@ from jaxpomdp._types import Posterior
 from jaxpomdp.kernels import grouped, native
 from jaxpomdp.kernels.grouped import capacities, group_rows, grouped_product, smooth_grouped
 from jaxpomdp.kernels.posterior import choose_plan, posterior
-from tests.kernels.problems import Problem, random_problem, stack, with_tape
+from tests.kernels.problems import Problem, quick_jit, random_problem, stack, with_tape
 from tests.kernels.test_smoothing import two_worlds
 from tests.oracles.hmm import enumerate_tape
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}
+run = quick_jit(posterior, static_argnames="plan")
 SINGLE = {"rtol": 2e-5, "atol": 2e-5}
 
 needs_native = pytest.mark.skipif(not native.available(), reason="needs a compiler for the native kernels")
@@ -46,14 +47,14 @@ def assert_enumerated(problems: list[list[Problem]], got: Posterior, **close: fl
 def test_each_plan_equals_enumeration(plan: str) -> None:
     for options in ({"starts": 0.3, "missing": 0.2}, {"zeros": 0.4, "padding": 1}):
         problems = batch(2, 5, **options)
-        assert_enumerated(problems, posterior(*stack(problems), plan=plan), **CLOSE)
+        assert_enumerated(problems, run(*stack(problems), plan=plan), **CLOSE)
 
 
 @pytest.mark.parametrize("plan", BATCHED)
 def test_plans_agree_in_float32_on_larger_batches(plan: str) -> None:
     problems = batch(3, 9, states=17, actions=4, steps=40, starts=0.05, missing=0.1, padding=3, scale=2.0)
     inputs = stack(problems, np.float32)
-    assert_same(posterior(*inputs, plan=plan), posterior(*inputs, plan="scan"), **SINGLE)
+    assert_same(run(*inputs, plan=plan), run(*inputs, plan="scan"), **SINGLE)
 
 
 @pytest.mark.parametrize("plan", BATCHED)
@@ -63,19 +64,19 @@ def test_groups_of_any_size(plan: str, skew: str) -> None:
     problems = batch(2, tapes, actions=actions, starts=0.1)
     if skew == "one action":
         problems = [[p._replace(actions=np.ones_like(p.actions)) for p in row] for row in problems]
-    assert_enumerated(problems, posterior(*stack(problems, np.float32), plan=plan), **SINGLE)
+    assert_enumerated(problems, run(*stack(problems, np.float32), plan=plan), **SINGLE)
 
 
 @pytest.mark.parametrize("plan", ["scan", *BATCHED])
 def test_a_tape_that_underflows_is_repaired_and_the_others_are_untouched(plan: str) -> None:
     bad, mild = two_worlds(100.0, 150.0), two_worlds(1.0, 2.0)
     problems = [[mild, mild, mild], [mild, bad, bad._replace(log_obs=-bad.log_obs)], [bad, bad, bad]]
-    assert_enumerated(problems, posterior(*stack(problems, np.float32), plan=plan), **SINGLE)
+    assert_enumerated(problems, run(*stack(problems, np.float32), plan=plan), **SINGLE)
 
 
 def test_the_grouped_plan_says_which_tapes_it_cannot_vouch_for() -> None:
     bad, mild = two_worlds(100.0, 150.0), two_worlds(1.0, 2.0)
-    got, trusted = jax.jit(smooth_grouped)(*stack([[mild, mild], [mild, bad]], np.float32))
+    got, trusted = quick_jit(smooth_grouped)(*stack([[mild, mild], [mild, bad]], np.float32))
     np.testing.assert_array_equal(trusted, [[True, True], [True, False]])
     np.testing.assert_allclose(got.xi[1], enumerate_tape(*mild).xi, rtol=1e-5)
 
@@ -87,7 +88,7 @@ def test_impossible_steps_and_dead_states_give_no_nan(plan: str) -> None:
     for row in problems:
         for problem in row:
             problem.log_obs[rng.random(problem.log_obs.shape) < 0.4] = -1e30
-    got = posterior(*stack(problems, np.float32), plan=plan)
+    got = run(*stack(problems, np.float32), plan=plan)
     assert all(np.isfinite(leaf).all() for leaf in got)
     assert_enumerated(problems, got, rtol=1e-4, atol=1e-4)
 
@@ -98,15 +99,15 @@ def test_what_lies_in_the_padding_does_not_matter(plan: str) -> None:
     clean = stack(problems, np.float32)
     chains, log_obs, actions, start, valid = clean
     spoilt = jnp.where(valid[..., None], log_obs, jnp.nan), jnp.where(valid, actions, 77), start | ~valid
-    got = posterior(chains, *spoilt, valid, plan=plan)
-    assert_same(got, posterior(*clean, plan=plan), rtol=0, atol=0)
+    got = run(chains, *spoilt, valid, plan=plan)
+    assert_same(got, run(*clean, plan=plan), rtol=0, atol=0)
 
 
 @pytest.mark.usefixtures("x64")
 def test_the_oracle_notices_a_product_with_the_wrong_group(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(grouped, "group_rows", lambda a, linked, n: group_rows((a + 1) % n, linked, n))
     problems = batch(1, 5)
-    got = jax.jit(lambda *x: smooth_grouped(*x)[0])(*stack(problems))
+    got = quick_jit(lambda *x: smooth_grouped(*x)[0])(*stack(problems))
     want = sum(enumerate_tape(*problem).xi for problem in problems[0])
     assert not np.allclose(got.xi[0], want, atol=1e-3)
 

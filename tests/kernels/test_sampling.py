@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from jaxpomdp.kernels.sampling import sample_path, sample_posterior
-from tests.kernels.problems import Problem, random_problem
+from tests.kernels.problems import Problem, quick_jit, random_problem
 from tests.kernels.test_smoothing import two_worlds
 from tests.oracles.hmm import enumerate_tape, log_of, path_weights
 
@@ -16,13 +16,13 @@ DRAWS = 4000
 
 def many_paths(problem: Problem, draws: int = DRAWS) -> np.ndarray:
     """Draw posterior paths; the forward pass is shared."""
-    run = jax.jit(jax.vmap(sample_posterior, in_axes=(0, None, None, None, None, None)))
+    run = quick_jit(jax.vmap(sample_posterior, in_axes=(0, None, None, None, None, None)))
     return np.asarray(run(jax.random.split(jax.random.key(0), draws), *problem.jax(np.float32)))
 
 
 def ancestral(problem: Problem, draws: int = DRAWS) -> np.ndarray:
     chain, _, *rest = problem.jax(np.float32)
-    run = jax.jit(jax.vmap(sample_path, in_axes=(0, None, None, None, None)))
+    run = quick_jit(jax.vmap(sample_path, in_axes=(0, None, None, None, None)))
     return np.asarray(run(jax.random.split(jax.random.key(1), draws), chain, *rest))
 
 
@@ -84,10 +84,10 @@ def test_draws_do_not_depend_on_padding_or_batch() -> None:
     key = jax.random.key(3)
     chain, log_obs, *rest = problem.jax(np.float32)
     chain_2, log_obs_2, *rest_2 = longer.jax(np.float32)
-    drawn, drawn_2 = sample_path(key, chain, *rest), sample_path(key, chain_2, *rest_2)
-    np.testing.assert_array_equal(drawn, drawn_2[:6])
-    drawn = sample_posterior(key, chain, log_obs, *rest)
-    np.testing.assert_array_equal(drawn, sample_posterior(key, chain_2, log_obs_2, *rest_2)[:6])
-    together = jax.vmap(sample_posterior, in_axes=(0, None, None, None, None, None))
+    free, given = quick_jit(sample_path), quick_jit(sample_posterior)
+    np.testing.assert_array_equal(free(key, chain, *rest), free(key, chain_2, *rest_2)[:6])
+    drawn = given(key, chain, log_obs, *rest)
+    np.testing.assert_array_equal(drawn, given(key, chain_2, log_obs_2, *rest_2)[:6])
+    together = quick_jit(jax.vmap(sample_posterior, in_axes=(0, None, None, None, None, None)))
     keys = jnp.stack([jax.random.key(9), key])
     np.testing.assert_array_equal(together(keys, chain, log_obs, *rest)[1], drawn)

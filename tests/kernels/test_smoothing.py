@@ -9,12 +9,12 @@ from jaxpomdp._types import Posterior
 from jaxpomdp.kernels import smoothing
 from jaxpomdp.kernels.smoothing import smooth, smooth_exact, smooth_scaled
 from jaxpomdp.numerics import NEG
-from tests.kernels.problems import Problem, log_of, random_problem
+from tests.kernels.problems import Problem, log_of, quick_jit, random_problem
 from tests.oracles.hmm import Answer, enumerate_tape
 
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}
-SMOOTH, EXACT = jax.jit(smooth), jax.jit(smooth_exact)
-SCALED = jax.jit(smooth_scaled)
+SMOOTH, EXACT, SCALED = (quick_jit(run) for run in (smooth, smooth_exact, smooth_scaled))
+OPTIMISED = jax.jit(smooth)
 ROUTES = {"smooth": SMOOTH, "exact": EXACT, "scaled": lambda *x: SCALED(*x)[0]}
 KINDS = {
     "plain": {},
@@ -51,7 +51,7 @@ def test_the_oracle_notices_a_broken_kernel(name: str, monkeypatch: pytest.Monke
     monkeypatch.setattr(smoothing, name, lambda *x: kernel(*x).at[..., 0].multiply(1 + 1e-8))
     problem = random_problem(0)
     with pytest.raises(AssertionError):
-        assert_answers(jax.jit(lambda *x: smooth(*x))(*problem.jax()), enumerate_tape(*problem), **CLOSE)
+        assert_answers(quick_jit(lambda *x: smooth(*x))(*problem.jax()), enumerate_tape(*problem), **CLOSE)
 
 
 @pytest.mark.usefixtures("x64")
@@ -69,9 +69,9 @@ def long_problem(steps: int, states: int) -> Problem:
 
 def test_float32_agrees_with_float64_over_a_trial() -> None:
     problem = long_problem(251, 20)
-    single = SMOOTH(*problem.jax(np.float32))
+    single = OPTIMISED(*problem.jax(np.float32))
     with jax.enable_x64(True):
-        double = SMOOTH(*problem.jax())
+        double = OPTIMISED(*problem.jax())
     np.testing.assert_allclose(single.log_evidence, double.log_evidence, rtol=1e-5)
     np.testing.assert_allclose(single.gamma, double.gamma, atol=1e-5)
     np.testing.assert_allclose(single.xi, double.xi, atol=1e-5 * 251)
@@ -79,9 +79,9 @@ def test_float32_agrees_with_float64_over_a_trial() -> None:
 
 def test_float32_agrees_with_float64_over_a_hundred_thousand_steps() -> None:
     problem = long_problem(100_000, 4)
-    single = SMOOTH(*problem.jax(np.float32))
+    single = OPTIMISED(*problem.jax(np.float32))
     with jax.enable_x64(True):
-        double = SMOOTH(*problem.jax())
+        double = OPTIMISED(*problem.jax())
     np.testing.assert_allclose(single.log_evidence, double.log_evidence, rtol=1e-5)
     np.testing.assert_allclose(single.gamma, double.gamma, atol=1e-5)
     np.testing.assert_allclose(single.xi, double.xi, rtol=1e-4)
@@ -171,7 +171,7 @@ def test_the_naive_sum_is_used_when_nothing_underflows() -> None:
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(smoothing, "smooth_exact", counted)
-            jax.block_until_ready(jax.jit(lambda *x: smooth(*x))(*problem.jax(np.float32)))
+            jax.block_until_ready(quick_jit(lambda *x: smooth(*x))(*problem.jax(np.float32)))
             jax.effects_barrier()
         assert len(calls) == turns
 
@@ -233,7 +233,7 @@ def test_one_lane_that_underflows_changes_no_other() -> None:
     easy = random_problem(0, states=2, actions=1, steps=4)
     bad = two_worlds(100.0, 150.0)
     batch = jax.tree.map(lambda *x: jnp.stack(x), easy.jax(np.float32), bad.jax(np.float32))
-    got = jax.jit(jax.vmap(smooth))(*batch)
+    got = quick_jit(jax.vmap(smooth))(*batch)
     alone = SCALED(*easy.jax(np.float32))[0]
     np.testing.assert_allclose(got.gamma[0], alone.gamma, rtol=1e-6)
     assert_answers(jax.tree.map(lambda x: x[1], got), enumerate_tape(*bad), rtol=1e-5, atol=1e-5)
@@ -241,5 +241,5 @@ def test_one_lane_that_underflows_changes_no_other() -> None:
 
 def test_the_derivative_of_the_scaled_evidence_is_defined_under_jit() -> None:
     chain, *tape = random_problem(4).jax(np.float32)
-    grad = jax.jit(jax.grad(lambda c: smooth_scaled(c, *tape)[0].log_evidence))(chain)
+    grad = quick_jit(jax.grad(lambda c: smooth_scaled(c, *tape)[0].log_evidence))(chain)
     np.testing.assert_allclose(grad.log_trans, SCALED(chain, *tape)[0].xi, atol=1e-5)
