@@ -34,9 +34,9 @@ def from_pomdp(
 
     Files describe one endless life. A trial ends in a state that is terminal: one of the ``E:`` lines, one
     that no action leaves and that pays nothing, or one of ``goal_states``. A goal's own reward, paid in the
-    file for leaving it whatever the action, is paid here for entering it, since nobody acts there. Costs
-    become negative rewards. Rewards that depend on the observation are averaged over it:
-    ``sum_o P(o | a, s') r(a, s, s', o)``.
+    file for leaving it whatever the action, is paid here for entering it, since nobody acts there; what a
+    goal that is never left would pay for ever is dropped. Costs become negative rewards. Rewards that depend
+    on the observation are averaged over it: ``sum_o P(o | a, s') r(a, s, s', o)``.
 
     The observation at a reset is that of the start state, or, where observations depend on the action, a
     symbol of its own that is put behind the others.
@@ -56,7 +56,7 @@ def from_pomdp(
     if discount is None and parsed.discount is None:
         raise ValueError("discount must be given, since the file has no discount line")
     goals = _goals(parsed, goal_states)
-    terminal = goals | _absorbing(parsed)
+    terminal = goals | (_for_ever(parsed) & np.all(parsed.expected_rewards() == 0, axis=0))
     terminal[list(parsed.end_states)] = True
     observation, first = _observations(parsed)
     extra = () if first is None else (FIRST_SYMBOL,)
@@ -121,19 +121,21 @@ def _sign(parsed: ParsedPOMDP) -> float:
     return -1.0 if parsed.values == "cost" else 1.0
 
 
-def _absorbing(parsed: ParsedPOMDP) -> np.ndarray:
+def _for_ever(parsed: ParsedPOMDP) -> np.ndarray:
+    """Return the mask of the states that no action leaves."""
     stays = [np.asarray(matrix.diagonal()) >= 1 - _SAME for matrix in parsed.transitions]
-    return np.all(stays, axis=0) & np.all(parsed.expected_rewards() == 0, axis=0)
+    return np.all(stays, axis=0)
 
 
 def _bonus(parsed: ParsedPOMDP, goals: np.ndarray) -> np.ndarray:
     """Return what entering each state pays beyond the transition, ``[N]``: a goal's reward for leaving it."""
     leaving = parsed.expected_rewards()
-    differs = goals & (np.ptp(leaving, axis=0) > _SAME)
+    left = goals & ~_for_ever(parsed)
+    differs = left & (np.ptp(leaving, axis=0) > _SAME)
     if differs.any():
         state = parsed.states[int(np.flatnonzero(differs)[0])]
         raise ValueError(f"goal_states must pay the same for every action on leaving, {state!r} does not")
-    return np.where(goals, _sign(parsed) * leaving[0], 0.0)
+    return np.where(left, _sign(parsed) * leaving[0], 0.0)
 
 
 def _outcomes(parsed: ParsedPOMDP, terminal: np.ndarray, bonus: np.ndarray) -> Tables:

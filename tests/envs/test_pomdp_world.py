@@ -93,7 +93,6 @@ def test_refusals(text, settings, message):
         ("cheese.95.POMDP", 1),
         ("tiger.95.POMDP", 0),
         ("gym-pomdps/heavenhell_2.pomdp", 4),
-        ("pobax/tiger-alt-start.POMDP", 1),
         ("pomdpx/Hallway.pomdpx", 4),
     ],
 )
@@ -101,6 +100,14 @@ def test_files_become_worlds_that_end_where_they_start_again(shared_dir, file, t
     world = read_world(shared_dir / "data/pomdp" / file)
     assert int(world.terminal.sum()) == terminal
     assert world.name == file.rpartition("/")[2].rpartition(".")[0]
+
+
+def test_a_goal_that_is_never_left_may_pay_what_it_likes(shared_dir):
+    file = shared_dir / "data/pomdp/pobax/tiger-alt-start.POMDP"
+    assert not read_world(file).terminal.any()
+    world = read_world(file, goal_states=["terminal"])
+    np.testing.assert_array_equal(world.terminal, [0, 0, 0, 0, 1])
+    np.testing.assert_array_equal(model_of(world).reward[:, :2], [[-1, -1], [-100, 10], [10, -100]])
 
 
 def test_a_world_written_and_read_is_the_same_world():
