@@ -1,4 +1,4 @@
-"""Control on beliefs: choices against their frequencies, learning from a tape against a slow account of it."""
+"""Control on beliefs: choices against frequencies, learning from a tape against a slow account of it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ N, A = 3, 2
 def slow_replay(q, trials, *, rule="sarsa", replacing=False):
     """SARSA(lambda) or Q(lambda), trial by trial, with a loop for every sum; trials as plain dicts."""
     q = np.array(q, np.float64)
-    value = lambda belief, a: sum(belief[n] * q[n, a] for n in range(len(belief)))
+
+    def value(belief, a):
+        return sum(belief[n] * q[n, a] for n in range(len(belief)))
+
     for trial in trials:
         trace = np.zeros_like(q)
         length = len(trial["actions"])
