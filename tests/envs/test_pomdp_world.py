@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 
 from jaxpomdp.envs.maze89 import maze57, maze89
 from jaxpomdp.envs.pomdp_file import read_pomdp, write_pomdp
 from jaxpomdp.envs.pomdp_world import FIRST_SYMBOL, from_pomdp, read_world, reset_states, to_pomdp
-from jaxpomdp.envs.world import model_of, reset_key, step_key
+from jaxpomdp.envs.world import model_of
 
 TEXT = """discount: 0.9
 values: cost
@@ -66,9 +65,9 @@ def test_end_states_end_trials():
 def test_a_symbol_for_the_first_observation_where_observations_belong_to_actions():
     world = from_pomdp(read_pomdp(TEXT + "O: look uniform\n"))
     assert world.observation_names == ("l", "r", "d", "g", FIRST_SYMBOL)
-    state, observation = reset_key(world, jax.random.key(0))
-    assert observation == 4
-    assert step_key(world, state, 1, jax.random.key(1)).observation < 4
+    np.testing.assert_array_equal(world.first_observation_prob, [[0, 0, 0, 0, 1]] * 4)
+    np.testing.assert_array_equal(world.observation_prob[..., 4], 0)
+    np.testing.assert_allclose(world.observation_prob[1, :, :4], 0.25)
 
 
 @pytest.mark.parametrize(
