@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -34,7 +35,7 @@ def test_the_path_is_the_best_of_all(kind: str) -> None:
 @pytest.mark.usefixtures("x64")
 def test_the_oracle_notices_a_broken_search(monkeypatch: pytest.MonkeyPatch) -> None:
     search = decoding._search
-    monkeypatch.setattr(decoding, "_search", lambda c, x, a, f: search(c, x, np.roll(a, 1), f))
+    monkeypatch.setattr(decoding, "_search", lambda c, x, a, f: search(c, x, jnp.roll(a, 1), f))
     run = quick_jit(lambda *x: viterbi(*x))
     problems = [random_problem(seed) for seed in range(6)]
     assert any(not np.isclose(run(*p.jax()).log_prob, enumerate_tape(*p).best, rtol=1e-10) for p in problems)
