@@ -45,6 +45,15 @@ struct Group {
 constexpr Index kBlock = 64;  // steps whose transitions are counted by one product
 constexpr int32_t kStart = -1, kPadding = -2;
 
+// The rows of one time lie far apart, too many streams for the processor to foresee: fetch each a step ahead.
+inline void fetch(const float* row, Index N) {
+  for (Index n = 0; n < N; n += 16) __builtin_prefetch(row + n);
+}
+inline void fetch_to_write(const float* row, Index N) {
+  for (Index n = 0; n < N; n += 16) __builtin_prefetch(row + n, 1);
+}
+
+// What a step's observation came to: the largest log-likelihood, and the probability that remains without it.
 struct Observed {
   float shift, norm;
 };
@@ -78,7 +87,7 @@ struct Step {  // what the backward pass reads and writes at one step of one row
 // gamma = alpha beta / overlap in place of alpha; left = alpha / overlap and right = weight, whose product over
 // steps counts transitions; then weight ∝ beta * exp(log_obs - shift), for the step before. False: not trusted.
 inline bool combine(const Step& at, Observed seen, Index N) {
-  const Step s = at;
+  const Step s = at;  // a local copy, which stores cannot touch
   const Vec shifts = splat(seen.shift);
   const bool heeded = seen.shift >= kImpossible;
   Vec both{}, mass{};
@@ -124,7 +133,7 @@ class Worker {
   void filter(Index unit) {
     enter(unit);
     forward();
-    for (Index lane = 0; lane < lanes_; ++lane) failed_[lane] ? exact(lane, nullptr, nullptr) : write_norms(lane);
+    for (Index lane = 0; lane < lanes_; ++lane) failed_[lane] ? exact_filter(lane) : write_norms(lane);
   }
 
   // Writes gamma and evidence; xi and initial of these rows go to `xi` [A, N, N] and `initial` [N].
@@ -138,7 +147,7 @@ class Worker {
     } while (!backward(initial));  // again without the rows whose underflow showed only now
     scale_counts(xi);
     for (Index lane = 0; lane < lanes_; ++lane)
-      if (failed_[lane]) exact(lane, xi, initial);
+      if (failed_[lane]) exact_smooth(lane, xi, initial);
   }
 
  private:
@@ -211,6 +220,8 @@ class Worker {
           std::memset(belief(lane, t), 0, N_ * sizeof(float));
           continue;
         }
+        fetch(log_obs(lane, std::min(t + 1, T_ - 1)), N_);
+        fetch_to_write(belief(lane, std::min(t + 1, T_ - 1)), N_);
         Observed seen = observe(log_obs(lane, t), now_ + lane * ld_, belief(lane, t), N_);
         observed_[t * lanes_ + lane] = seen;
         if (!(seen.norm >= kOverlapFloor)) failed_[lane] = true;
@@ -253,6 +264,8 @@ class Worker {
     const Index block = how >= 0 ? how : p_.A, slot = (block * kBlock + (how >= 0 ? filled_[how] : 0)) * ld_;
     float* gamma = belief(lane, t);
     const Step step{log_obs(lane, t), now_ + lane * ld_, gamma, weight_ + lane * ld_, left_ + slot, right_ + slot};
+    fetch(log_obs(lane, std::max<Index>(t - 1, 0)), N_);
+    fetch(belief(lane, std::max<Index>(t - 1, 0)), N_);
     if (!combine(step, observed_[t * lanes_ + lane], N_)) return false;
     if (how >= 0 && ++filled_[how] == kBlock) count_block(how);
     if (arrival(lane, t) == kStart)
@@ -278,9 +291,10 @@ class Worker {
     }
   }
 
-  void exact(Index lane, float* xi, float* initial);
+  // In exact.h.
+  void exact_filter(Index lane);
+  void exact_smooth(Index lane, float* xi, float* initial);
   std::vector<double> exact_forward(Index lane, std::vector<double>& log_belief) const;
-  void exact_counts(const double* belief, const double* weight, double norm, Index a, float* xi) const;
 
   const Problem& p_;
   const Index N_, T_;
