@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array, pytree
+from jaxpomdp.kernels import emissions
 from jaxpomdp.models import estimates
 from jaxpomdp.models.estimates import LOG_TWO_PI, Moments
 from jaxpomdp.models.family import Prior
@@ -38,7 +39,7 @@ class Categorical:
 
     def log_density(self, x: Array) -> Array:
         """Return ``log p(x | s)``, ``[..., N]``."""
-        return jnp.take(self.log_prob.T, x, axis=0, mode="clip")
+        return emissions.categorical_log_prob(self.log_prob, x)
 
     def features(self, x: Array, mask: Array) -> Array:
         """Return one-hot rows ``[..., O]`` where ``mask[...]``; nothing for a wide alphabet."""
@@ -162,10 +163,7 @@ class DiagonalGaussian(_MeanAndVariance):
 
     def log_density(self, x: Array) -> Array:
         """Return ``log N(x; mean, var)`` summed over coordinates, ``[..., N]``."""
-        away = x.reshape(-1, 1, x.shape[-1]) - self.mean[None]
-        constant = jnp.sum(LOG_TWO_PI + jnp.log(self.var), axis=-1)
-        density = -0.5 * (jnp.sum(away**2 * (1 / self.var)[None], axis=-1) + constant[None])
-        return density.reshape(*x.shape[:-1], -1)
+        return emissions.diagonal_log_prob(self.mean, self.var, x)
 
     def features(self, x: Array, mask: Array) -> Array:
         """Return one, ``x`` from the data's mean, and its square, where ``mask[...]``: ``[..., 1 + 2D]``."""
@@ -198,7 +196,11 @@ class ReturnModel(_MeanAndVariance):
     var: Array
 
     def log_density(self, returns: Array, actions: Array) -> Array:
-        """Return ``log N(R; mean, var)`` for ``returns[...]`` after ``actions[...]``, ``[..., N]``."""
+        """Return ``log N(R; mean, var)`` for ``returns[...]`` after ``actions[...]``, ``[..., N]``.
+
+        As ``kernels.emissions.return_log_density``, but logarithms are taken once per state and action, not
+        once per step and state.
+        """
         tables = (self.mean, 1 / self.var, LOG_TWO_PI + jnp.log(self.var))
         mean, precision, constant = (self._rows(table, actions) for table in tables)
         return -0.5 * ((returns[..., None] - mean) ** 2 * precision + constant)

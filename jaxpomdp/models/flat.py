@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxpomdp._types import Array, Chain, Posterior, TrialBatch, pytree
+from jaxpomdp.kernels.emissions import tempered, unless_missing
 from jaxpomdp.models import estimates
 from jaxpomdp.models.checks import check
 from jaxpomdp.models.emission import GaussianStatistics, ReturnModel
@@ -58,7 +59,7 @@ def _acting(params: FlatParams) -> Chain:
 
 def _observation_density(params: FlatParams, observations: tuple[Array, ...], observed: Array) -> Array:
     total = sum(channel.log_density(x) for channel, x in zip(params.emissions, observations, strict=True))
-    return jnp.where(observed[..., None], total, 0)
+    return unless_missing(total, observed)
 
 
 def _log_obs(params: FlatParams, observations: tuple[Array, ...], observed: Array) -> Array:
@@ -68,8 +69,8 @@ def _log_obs(params: FlatParams, observations: tuple[Array, ...], observed: Arra
 def _learning(params: FlatParams, batch: TrialBatch, theta: float) -> tuple[Chain, Array]:
     log_obs = _observation_density(params, batch.observations, batch.observed)
     if theta != 0:
-        tempered = theta * params.returns.log_density(batch.returns, batch.actions)
-        log_obs = log_obs + jnp.where(batch.has_return[..., None], tempered, 0)
+        log_return = params.returns.log_density(batch.returns, batch.actions)
+        log_obs = tempered(log_obs, log_return, theta, batch.has_return)
     return _acting(params), _mask(params, log_obs)
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array, pytree
+from jaxpomdp.kernels import emissions
 from jaxpomdp.models import estimates
 from jaxpomdp.models.emission import GaussianStatistics, check_vectors, pooled_width
 from jaxpomdp.models.estimates import LOG_TWO_PI, Moments
@@ -22,19 +22,7 @@ class FullGaussian:
 
     def log_density(self, x: Array) -> Array:
         """Return ``log N(x; mean, cov)``, ``[..., N]``."""
-        whiten, log_det = self._whitening()
-        away = x.reshape(-1, 1, x.shape[-1]) - self.mean[None]
-        scaled = jnp.einsum("nij,rnj->rni", whiten, away, precision="highest")
-        constant = self.mean.shape[-1] * LOG_TWO_PI + log_det
-        density = -0.5 * (jnp.sum(scaled**2, axis=-1) + constant[None])
-        return density.reshape(*x.shape[:-1], -1)
-
-    def _whitening(self) -> tuple[Array, Array]:
-        """Return ``W[N, D, D]`` with ``W^T W = cov^-1``, and ``log det cov``."""
-        factor = jnp.linalg.cholesky(self.cov)
-        eye = jnp.broadcast_to(jnp.eye(self.cov.shape[-1], dtype=self.cov.dtype), self.cov.shape)
-        diagonal = jnp.diagonal(factor, axis1=-2, axis2=-1)
-        return jax.scipy.linalg.solve_triangular(factor, eye, lower=True), 2 * jnp.sum(jnp.log(diagonal), -1)
+        return emissions.full_log_prob(self.mean, self.cov, x)
 
     def features(self, x: Array, mask: Array) -> Array:
         """Return one, the distance from the data's mean and its outer product, ``[..., 1 + D + D^2]``."""
@@ -78,7 +66,7 @@ class FullGaussian:
 
     def _deviance(self, scatter: Array, weight: Array | float) -> Array:
         """Return ``weight log det cov + trace(cov^-1 scatter)``, ``[N]``."""
-        whiten, log_det = self._whitening()
+        whiten, log_det = emissions.whitening(self.cov)
         precision = jnp.einsum("nij,nik->njk", whiten, whiten, precision="highest")
         return weight * log_det + jnp.sum(precision * scatter, axis=(-2, -1))
 

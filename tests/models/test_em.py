@@ -17,6 +17,7 @@ from jaxpomdp.models.flat import FLAT
 from jaxpomdp.numerics import NEG
 from tests.models.problems import (
     LIGHT,
+    SCALED,
     batch,
     model,
     models,
@@ -69,7 +70,7 @@ def test_a_step_equals_brute_force() -> None:
 
 @pytest.mark.usefixtures("x64")
 def test_a_step_equals_brute_force_with_independent_coordinates_and_returns_by_state() -> None:
-    assert max(step_errors(LIGHT, full=False, columns=1).values()) < 1e-10
+    assert max(step_errors(SCALED, full=False, columns=1).values()) < 1e-10
 
 
 @pytest.mark.usefixtures("x64")
@@ -80,7 +81,7 @@ def test_brute_force_notices_a_broken_step() -> None:
         shifted = replace(tapes, actions=jnp.roll(tapes.actions, 1, axis=-1))
         return FLAT.statistics(params, shifted, seen._replace(xi=jnp.swapaxes(seen.xi, 1, 2)))
 
-    errors = step_errors(LIGHT._replace(statistics=statistics), full=False)
+    errors = step_errors(SCALED._replace(statistics=statistics), full=False)
     assert errors["return_mean"] > 0.01
     assert errors["trans"] > 0.01
     assert errors["init"] < 1e-10
@@ -93,8 +94,8 @@ def test_the_objective_never_falls(theta: float) -> None:
     prior = Prior(variance_strength=1.0, variance_floor=0.2)
     config = EMConfig(iterations=60, tolerance=0.0, theta=theta, prior=prior)
     tapes, params = stack(batch(), 3), models(3)
-    before = jax.vmap(LIGHT.statistics)(params, tapes, even_posterior(params, tapes))
-    report = em_fit(LIGHT, params, tapes, config, scale_statistics(before, 0.5))[1]
+    before = jax.vmap(SCALED.statistics)(params, tapes, even_posterior(params, tapes))
+    report = em_fit(SCALED, params, tapes, config, scale_statistics(before, 0.5))[1]
     assert not report.fell.any()
     assert float(report.drop.max()) < 1e-10
     assert (report.trace[:, -1] > report.trace[:, 0] + 1).all()

@@ -12,7 +12,7 @@ from jaxpomdp.models.family import Prior
 from jaxpomdp.models.flat import FLAT
 from jaxpomdp.models.gradient import GradientConfig, fit_gradient, objective
 from tests.models.problems import (
-    LIGHT,
+    SCALED,
     assert_trees_close,
     batch,
     model,
@@ -32,8 +32,9 @@ def test_the_gradient_is_that_of_the_expected_log_likelihood() -> None:
 
     The one side differentiates the forward pass, the other uses the backward pass and no derivative of it.
     """
-    params, tapes, prior = to_params(rich_model()), to_batch(rich_trials()), Prior(variance_strength=2.0)
-    _, info = em_step(LIGHT, stack(params), stack(tapes), EMConfig(theta=0.3, prior=prior))
+    params, tapes = to_params(rich_model(), full=False), to_batch(rich_trials())
+    prior = Prior(variance_strength=2.0)
+    _, info = em_step(SCALED, stack(params), stack(tapes), EMConfig(theta=0.3, prior=prior))
     statistics = jax.tree.map(lambda x: x[0], info.statistics)
 
     def expected(free):
@@ -52,7 +53,7 @@ def test_the_gradient_is_that_of_the_expected_log_likelihood() -> None:
 @pytest.mark.usefixtures("x64")
 def test_gradient_and_em_reach_the_same_height() -> None:
     params, tapes = model(), batch()
-    _, report = fit(LIGHT, params, tapes, EMConfig(iterations=2000, tolerance=1e-10, theta=0.2))
+    _, report = fit(SCALED, params, tapes, EMConfig(iterations=2000, tolerance=1e-10, theta=0.2))
     ascended, trace = fit_gradient(FLAT, params, tapes, GradientConfig(iterations=1500, theta=0.2))
     assert trace.shape == (1500,)
     np.testing.assert_allclose(trace[0], report.trace[0], rtol=1e-8)

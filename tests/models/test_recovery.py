@@ -10,10 +10,9 @@ import pytest
 from jaxpomdp.models.data import trial_batch
 from jaxpomdp.models.em import EMConfig, fit
 from jaxpomdp.models.family import Prior
-from jaxpomdp.models.flat import FLAT
 from jaxpomdp.models.init import random_params
 from jaxpomdp.models.selection import fit_restarts
-from tests.models.problems import LIGHT
+from tests.models.problems import LIGHT, SCALED
 
 TRANS = np.array([[[0.9, 0.1], [0.2, 0.8]], [[0.1, 0.9], [0.7, 0.3]]])
 SYMBOLS = np.array([[0.8, 0.15, 0.05], [0.1, 0.1, 0.8]])
@@ -72,7 +71,7 @@ def test_without_actions_it_equals_hmmlearn() -> None:
     peer.fit(np.concatenate(sequences)[:, None], [len(sequence) for sequence in sequences])
     bare = Prior(transition=0.0, initial=0.0, observation=0.0)
     params, report = fit(
-        FLAT, start, trial_batch(sequences), EMConfig(iterations=10, tolerance=0.0, prior=bare)
+        SCALED, start, trial_batch(sequences), EMConfig(iterations=10, tolerance=0.0, prior=bare)
     )
     np.testing.assert_allclose(np.exp(params.log_init), peer.startprob_, atol=1e-9)
     np.testing.assert_allclose(np.exp(params.log_trans[0]), peer.transmat_, atol=1e-9)
