@@ -8,24 +8,13 @@ import jax
 import numpy as np
 
 from jaxpomdp._types import TrialBatch
-from jaxpomdp.numerics import NEG, stop_if_not_finite
+from jaxpomdp.models.estimates import check_positive, check_rows
+from jaxpomdp.numerics import stop_if_not_finite
 
 
 def _shape(name: str, array: Any, expected: tuple[int, ...]) -> None:
     if tuple(array.shape) != expected:
         raise ValueError(f"{name} must have shape {expected}, got {tuple(array.shape)}")
-
-
-def check_rows(name: str, log_prob: Any, rows: np.ndarray) -> None:
-    """Refuse log-probability rows (last axis) that do not sum to one, where ``rows``.
-
-    Raises:
-        ValueError: naming the argument, with the sum that came.
-    """
-    total = np.exp(np.maximum(np.asarray(log_prob, dtype=np.float64), NEG)).sum(axis=-1)
-    wrong = rows & (np.abs(total - 1) > 1e-3)
-    if wrong.any():
-        raise ValueError(f"{name} must have rows that sum to one, got a sum of {total[wrong][0]:.6g}")
 
 
 def check_batch(batch: TrialBatch, actions: int) -> None:
@@ -74,6 +63,9 @@ def check_params(params: Any) -> None:
     check_rows("params.log_init", params.log_init, np.ones(lead, bool))
     everywhere = np.broadcast_to(alive[..., None, :], (*lead, actions, states))
     check_rows("params.log_trans", params.log_trans, everywhere)
+    check_positive("params.returns.var", params.returns.var, alive)
+    for index, channel in enumerate(params.emissions):
+        channel.check_params(alive, f"params.emissions[{index}]")
 
 
 def check(params: Any, batch: TrialBatch) -> None:

@@ -91,6 +91,10 @@ class Categorical:
         """Return the channel with rows for ``spare`` more states."""
         return Categorical(estimates.pad_states(self.log_prob, spare, -math.log(self.log_prob.shape[-1])))
 
+    def check_params(self, alive: np.ndarray, name: str) -> None:
+        """Refuse rows of living states that do not sum to one."""
+        estimates.check_rows(f"{name}.log_prob", self.log_prob, alive)
+
     def check(self, x: np.ndarray, observed: np.ndarray, name: str) -> None:
         """Refuse observations that are not symbols of this channel."""
         symbols = self.log_prob.shape[-1]
@@ -179,6 +183,10 @@ class DiagonalGaussian(_MeanAndVariance):
     def feasible(self, x: Array, mask: Array, prior: Prior, carry: GaussianStatistics | None) -> Self:
         """Lift variances to the floor that the data set."""
         return self.lifted(pooled_width(x, mask, carry), prior)
+
+    def check_params(self, alive: np.ndarray, name: str) -> None:
+        """Refuse variances of living states that are not positive."""
+        estimates.check_positive(f"{name}.var", self.var, alive)
 
     def check(self, x: np.ndarray, observed: np.ndarray, name: str) -> None:
         """Refuse observations of another dimension, and numbers that are not finite."""

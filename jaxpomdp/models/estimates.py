@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxpomdp._types import Array
 from jaxpomdp.models.family import Prior
@@ -52,6 +53,29 @@ def dirichlet_mode(old: Array, counts: Array, pseudo: float | Array) -> Array:
     mass = jnp.where(old > NEG / 2, counts + pseudo, 0)
     total = jnp.sum(mass, axis=-1, keepdims=True)
     return jnp.where(total > 0, safe_log(mass / jnp.where(total > 0, total, 1)), old)
+
+
+def check_rows(name: str, log_prob: Any, rows: np.ndarray) -> None:
+    """Refuse log-probability rows (last axis) that do not sum to one, where ``rows``; on the host.
+
+    Raises:
+        ValueError: naming the argument, with the sum that came.
+    """
+    total = np.exp(np.maximum(np.asarray(log_prob, dtype=np.float64), NEG)).sum(axis=-1)
+    wrong = rows & (np.abs(total - 1) > 1e-3)
+    if wrong.any():
+        raise ValueError(f"{name} must have rows that sum to one, got a sum of {total[wrong][0]:.6g}")
+
+
+def check_positive(name: str, variance: Any, rows: np.ndarray) -> None:
+    """Refuse variances ``[..., N, D]`` that are not above zero, where ``rows[..., N]``; on the host.
+
+    Raises:
+        ValueError: naming the argument, with the variance that came.
+    """
+    least = np.asarray(variance).min(axis=-1)
+    if (rows & ~(least > 0)).any():
+        raise ValueError(f"{name} must be positive, got {least[rows].min():.6g}")
 
 
 def dirichlet_score(log_prob: Array, counts: float | Array) -> Array:

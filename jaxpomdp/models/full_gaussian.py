@@ -103,6 +103,10 @@ class FullGaussian:
             estimates.pad_states(self.mean, spare, 0), jnp.where(absent[:, None, None], eye, cov)
         )
 
+    def check_params(self, alive: np.ndarray, name: str) -> None:
+        """Refuse covariances of living states that are not positive definite."""
+        estimates.check_positive(f"{name}.cov (eigenvalues)", np.linalg.eigvalsh(self.cov), alive)
+
     def check(self, x: np.ndarray, observed: np.ndarray, name: str) -> None:
         """Refuse observations of another dimension, and numbers that are not finite."""
         check_vectors(x, observed, self.mean.shape[-1], name)

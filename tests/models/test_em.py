@@ -196,6 +196,12 @@ def test_errors_name_the_argument() -> None:
         fit(FLAT, replace(params, log_init=params.log_init * jnp.nan), tapes)
     with pytest.raises(ValueError, match=r"batch must have axes"):
         fit(FLAT, stack(params, 2), stack(tapes, 3))
+    flat_rows = replace(params, emissions=(Categorical(params.emissions[0].log_prob - 1),))
+    with pytest.raises(ValueError, match=r"params.emissions\[0\].log_prob must have rows that sum to one"):
+        fit(FLAT, flat_rows, tapes)
+    returns = replace(params.returns, var=params.returns.var * 0)
+    with pytest.raises(ValueError, match=r"params.returns.var must be positive, got 0"):
+        fit(FLAT, replace(params, returns=returns), tapes)
     with pytest.raises(ValueError, match="iterations must be at least 1"):
         EMConfig(iterations=0)
     with pytest.raises(ValueError, match="freeze must hold names among"):
