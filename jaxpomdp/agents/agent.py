@@ -282,9 +282,9 @@ class Agent:
             trials: for each seed.
             key: of the chance in these trials, the same for any ``state``.
         """
-        seeds = state.recent.shape[0]
-        keys = jax.vmap(lambda s: jax.random.key_data(jax.random.fold_in(key, s)))(jnp.arange(seeds))
-        zero = jnp.zeros(seeds, jnp.int32)
+        of_seed = jax.vmap(lambda seed: jax.random.key_data(jax.random.fold_in(key, seed)))
+        keys = of_seed(jnp.asarray(state.actor.keys)[:, -1])
+        zero = jnp.zeros(len(keys), jnp.int32)
         actor = Actor(keys, state.actor.q, zero, zero)
         control = replace(self.config.control, schedule=GREEDY, exploration="epsilon", alpha=0.0)
         _, log, count = run_trials(self.family, control, self.world, state.params, actor, trials=trials)

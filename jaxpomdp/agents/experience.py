@@ -208,9 +208,9 @@ def _start_returns(trials: Trials, gamma: float) -> np.ndarray:
 
 
 def split_log(log: Any, count: int) -> list[Trials]:
-    """Cut the log of an online phase (``trial.Log``, arrays ``[L, S]``) into each seed's trials."""
-    host = type(log)(*(np.asarray(field[:count]) for field in log))
-    return [_trials_of(type(log)(*(field[:, s] for field in host))) for s in range(host.action.shape[1])]
+    """Cut the log of an online phase (``trial.Log``, arrays ``[S, L]``) into each seed's trials."""
+    host = type(log)(*(np.asarray(field)[:, :count] for field in log))
+    return [_trials_of(type(log)(*row)) for row in zip(*host, strict=True)]
 
 
 def _trials_of(log: Any) -> Trials:

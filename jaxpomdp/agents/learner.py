@@ -202,7 +202,7 @@ def replay(
 ) -> Array:
     """Learn values once more from stored tapes, by the beliefs of the model as it is now: ``q[S, N, A]``."""
     beliefs = filter_batch(family, params, batch)
-    if native.available() and not config.replacing and config.rule == "sarsa":
+    if native.available() and q.dtype == jnp.float32:
         return native.sarsa_replay(
             q,
             beliefs,
@@ -215,6 +215,8 @@ def replay(
             gamma=config.gamma,
             lam=lam,
             passes=passes,
+            replacing=config.replacing,
+            rule=config.rule,
         )
 
     def one(value: Array, data: ReplayData) -> Array:

@@ -18,6 +18,7 @@ from jaxpomdp.agents import control
 from jaxpomdp.agents.control import ControlConfig, Lane, Memory
 from jaxpomdp.envs import world as worlds
 from jaxpomdp.envs.world import World
+from jaxpomdp.kernels import native
 from jaxpomdp.kernels.filtering import observe, propagate
 from jaxpomdp.models.family import Family
 
@@ -42,7 +43,7 @@ class Actor:
 
 
 class Log(NamedTuple):
-    """What happened, action by action and in order: every array is ``[L, S]``.
+    """What happened, action by action and in order: every array is ``[S, L]``.
 
     ``observation`` before the ``action``, ``reward`` for it, ``arrived`` the observation after it;
     ``active`` (else the seed had finished), ``ended``, ``terminated``, and ``best``, the agent's own best
@@ -149,7 +150,24 @@ def _advance(
     return jax.tree.map(lambda x, y: jnp.where(active, x, y), moved, rest), log
 
 
-@partial(jax.jit, static_argnames=("family", "config", "trials", "learning"))
+PLANS = ("auto", "loop", "native")
+"""How trials may be run: a loop of JAX's own, or the native kernel; both do the same, up to rounding."""
+
+
+def choose_plan(plan: str, dtype: Any) -> str:
+    """Resolve ``auto``, and check that a named plan can run here.
+
+    Raises:
+        ValueError: ``plan`` is not known, or is ``native`` where that cannot run.
+    """
+    if plan not in PLANS:
+        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
+    fits = plan != "loop" and dtype == jnp.float32 and native.available()
+    if plan == "native" and not fits:
+        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
+    return "native" if fits else "loop"
+
+
 def run_trials(
     family: Family,
     config: ControlConfig,
@@ -159,6 +177,7 @@ def run_trials(
     *,
     trials: int,
     learning: bool = True,
+    plan: str = "auto",
 ) -> tuple[Actor, Log, Array]:
     """Run ``trials`` trials of every seed, learning values on the way (thesis section 3.3, online phase).
 
@@ -166,27 +185,94 @@ def run_trials(
         family: the kind of model.
         config: control settings.
         world: shared by all seeds.
-        params: models with leading axis ``S``.
+        params: models with leading axis ``S``, or 1 for a model that all share.
         actor: keys, values and counts.
         trials: for each seed.
         learning: False leaves the values as they are.
+        plan: one of ``PLANS``.
 
     Returns:
-        The actor, the log ``[trials * step_limit, S]``, and the number of its rows that were written.
+        The actor, the log ``[S, trials * step_limit]``, and how many of its columns were written.
+
+    Raises:
+        ValueError: ``plan`` is not known or cannot run here.
     """
-    seeds = actor.trials.shape[0]
-    limit = world.step_limit
+    chosen = choose_plan(plan, actor.q.dtype)
+    return _run(family, config, world, params, actor, trials=trials, learning=learning, plan=chosen)
+
+
+@partial(jax.jit, static_argnames=("family", "config", "trials", "learning", "plan"))
+def _run(
+    family: Family,
+    config: ControlConfig,
+    world: World,
+    params: Any,
+    actor: Actor,
+    *,
+    trials: int,
+    learning: bool,
+    plan: str,
+) -> tuple[Actor, Log, Array]:
     memory = jax.vmap(partial(memory_of, family))(params)
-    draws = _draws(actor.keys, actor.trials, trials, limit)
+    draws = _draws(actor.keys, actor.trials, trials, world.step_limit)
     rate = config.alpha if learning else 0.0
-    advance = jax.vmap(partial(_advance, family, config, rate, world, trials))
-    begin = jax.vmap(partial(_reset, family, config, world))
+    run = _natively if plan == "native" else _in_a_loop
+    q, steps, log, count = run(family, config, rate, world, trials, memory, actor, draws)
+    return Actor(actor.keys, q, actor.trials + trials, steps), log, count
+
+
+def _natively(
+    family: Family,
+    config: ControlConfig,
+    rate: float,
+    world: World,
+    trials: int,
+    memory: Memory,
+    actor: Actor,
+    draws: Array,
+) -> tuple[Array, Array, Log, Array]:
+    symbols = jnp.arange(world.num_observations)
+    seen = jnp.ones(symbols.shape, bool)
+    log_obs = jax.vmap(lambda params: family.log_obs(params, (symbols,), seen))(memory.params)
+    ahead = jnp.arange(trials * world.step_limit + 1)[None, :]
+    level = config.schedule.function()(actor.steps[:, None] + ahead)
+    acted = native.act(
+        native.ActingModel(memory.init, memory.trans, log_obs),
+        actor.q,
+        draws,
+        jnp.broadcast_to(level, (actor.steps.shape[0], ahead.shape[1])).astype(jnp.float32),
+        native.WorldTables(*(getattr(world, name) for name in native.WorldTables._fields)),
+        jnp.array([rate, config.gamma, config.lam, config.sticky], jnp.float32),
+        replacing=config.replacing,
+        rule=config.rule,
+        exploration=config.exploration,
+    )
+    log = Log(*(getattr(acted, name) for name in Log._fields))
+    return acted.q, actor.steps + acted.steps, log, jnp.max(acted.steps)
+
+
+def _in_a_loop(
+    family: Family,
+    config: ControlConfig,
+    rate: float,
+    world: World,
+    trials: int,
+    memory: Memory,
+    actor: Actor,
+    draws: Array,
+) -> tuple[Array, Array, Log, Array]:
+    seeds = actor.trials.shape[0]
+    shared = memory.init.shape[0] == 1
+    memory = jax.tree.map(lambda x: x[0], memory) if shared else memory
+    of_memory = None if shared else 0
+    advance = jax.vmap(partial(_advance, family, config, rate, world, trials), in_axes=(of_memory, 0, 0))
+    begin = jax.vmap(partial(_reset, family, config, world), in_axes=(of_memory, 0, 0))
     zero = jnp.zeros(seeds, jnp.int32)
     nothing = jnp.zeros(actor.q.shape[:2], actor.q.dtype)
     lane = Lane(actor.q, jnp.zeros_like(actor.q), nothing, zero, zero > 0, actor.steps)
     seed = begin(memory, _Seed(lane, zero, zero, zero, zero), draws[:, 0, 0])
     shapes = jax.eval_shape(advance, memory, seed, draws)[1]
-    log = jax.tree.map(lambda x: jnp.zeros((trials * limit, *x.shape), x.dtype), shapes)
+    log = jax.tree.map(lambda x: jnp.zeros((trials * world.step_limit, *x.shape), x.dtype), shapes)
 
     def unfinished(carry: tuple[Array, _Seed, Log]) -> Array:
         return jnp.any(carry[1].trial < trials)
@@ -198,4 +284,4 @@ def run_trials(
         return count + 1, now, jax.tree.map(write, so_far, row)
 
     count, seed, log = lax.while_loop(unfinished, body, (jnp.zeros((), jnp.int32), seed, log))
-    return Actor(actor.keys, seed.lane.q, actor.trials + trials, seed.lane.steps), log, count
+    return seed.lane.q, seed.lane.steps, jax.tree.map(jnp.transpose, log), count

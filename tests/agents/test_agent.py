@@ -34,7 +34,7 @@ SETTINGS = {
     "gate": 0.0,
 }
 KEY = jax.random.key(1)
-COMPILED = (trial.run_trials, learner.refit, learner.replay, learner.gather_evidence, learner.with_returns)
+COMPILED = (trial._run, learner.refit, learner.replay, learner.gather_evidence, learner.with_returns)
 
 
 def small(**settings):
@@ -82,7 +82,7 @@ def outcomes(row):
 
 def test_a_run_compiles_each_function_once_or_twice(run):
     assert dict(zip((f.__name__ for f in COMPILED), run.compiled.tolist(), strict=True)) == {
-        "run_trials": 1,
+        "_run": 1,
         "refit": 1,
         "replay": 1,
         "gather_evidence": 1,

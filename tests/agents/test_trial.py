@@ -12,8 +12,11 @@ import pytest
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.experience import split_log
 from jaxpomdp.agents.trial import Actor, run_trials
+from jaxpomdp.envs import registry
 from jaxpomdp.envs.host import HostWorld
 from jaxpomdp.envs.tmaze import tmaze
+from jaxpomdp.envs.wrappers import limited
+from jaxpomdp.kernels import native
 from jaxpomdp.kernels.control import ReplayData, replay_tape
 from jaxpomdp.models import init as starts
 from jaxpomdp.models.flat import FLAT
@@ -164,6 +167,51 @@ def test_two_calls_are_one(usual):
         np.testing.assert_array_equal(np.concatenate([p[s].actions for p in pieces]), whole.actions)
         np.testing.assert_array_equal(np.concatenate([p[s].lengths for p in pieces]), whole.lengths)
     np.testing.assert_allclose(actor.q, usual[0].q, atol=1e-6)
+
+
+@pytest.mark.skipif(not native.available(), reason="needs a C++ compiler for the native kernels")
+@pytest.mark.parametrize(
+    ("rule", "replacing", "exploration", "world"),
+    [
+        ("sarsa", False, "epsilon", "maze89"),
+        ("q", False, "boltzmann", "maze89"),
+        ("q", True, "epsilon", "hallway-noise"),
+    ],
+)
+def test_the_native_kernel_does_what_the_loop_does(rule, replacing, exploration, world):
+    world = limited(registry.make(world), 60)
+    config = replace(
+        CONTROL, alpha=0.05, rule=rule, replacing=replacing, exploration=exploration, sticky=0.5,
+        schedule=Schedule(0.4, 0.1, 100),
+    )  # fmt: skip
+    sizes = (19, world.num_actions, world.num_observations)
+    models = starts.stack_models([starts.random_params(seed, *sizes, capacity=24) for seed in SEEDS])
+    q = jax.random.normal(jax.random.key(1), (len(SEEDS), 24, world.num_actions))
+    actor = replace(actor_of(SEEDS), q=q)
+    loop, kernel = (
+        run_trials(FLAT, config, world, models, actor, trials=2, plan=plan) for plan in ("loop", "native")
+    )
+    np.testing.assert_allclose(kernel[0].q, loop[0].q, atol=5e-6)
+    assert_same(kernel[0].steps, loop[0].steps)
+    for one, other in zip(split_log(*loop[1:]), split_log(*kernel[1:]), strict=True):
+        for name, mine, theirs in zip(one._fields, one, other, strict=True):
+            np.testing.assert_allclose(theirs, mine, atol=1e-5, err_msg=name)
+
+
+def test_a_plan_that_cannot_run_is_refused():
+    with pytest.raises(ValueError, match="plan must be one of"):
+        run_trials(FLAT, CONTROL, WORLD, models_of(SEEDS), actor_of(SEEDS), trials=1, plan="fast")
+
+
+def test_a_model_may_be_shared():
+    one = jax.tree.map(lambda x: x[:1], models_of(SEEDS))
+    copies = jax.tree.map(lambda x: jnp.repeat(x, len(SEEDS), axis=0), one)
+    for plan in ("loop", "auto"):
+        shared, many = (
+            run_trials(FLAT, CONTROL, WORLD, models, actor_of(SEEDS), trials=2, plan=plan)
+            for models in (one, copies)
+        )
+        np.testing.assert_allclose(shared[0].q, many[0].q, atol=1e-6)
 
 
 @pytest.mark.slow

@@ -10,13 +10,15 @@ Shapes: ``S`` models, ``B`` rows, ``T`` steps, ``N`` states, ``A`` actions.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from jaxpomdp._types import Array, Posterior
 from jaxpomdp.kernels.native.build import loaded
 
-__all__ = ["available", "estep", "filter_tapes", "sarsa_replay"]
+__all__ = ["Acted", "ActingModel", "WorldTables", "act", "available", "estep", "filter_tapes", "sarsa_replay"]
 
 RULES = ("sarsa", "q")
 
@@ -171,3 +173,104 @@ def sarsa_replay(
     call = jax.ffi.ffi_call("jaxpomdp_replay", *_float32(q.shape), vmap_method="broadcast_all")
     flags = {"passes": passes, "replacing": replacing, "greedy": rule == "q"}
     return call(q, beliefs, actions, rewards, start, valid, terminated, settings, **flags)
+
+
+class ActingModel(NamedTuple):
+    """What acting needs of ``M`` models: ``init[M, N]``, ``trans[M, A, N, N]``, ``log_obs[M, O, N]``."""
+
+    init: Array
+    trans: Array
+    log_obs: Array
+
+
+class WorldTables(NamedTuple):
+    """A world of ``X`` states and ``K`` outcomes; fields, in their order, as in ``envs.world.World``."""
+
+    successors: Array
+    transition_cdf: Array
+    reward: Array
+    observation_cdf: Array
+    first_observation_cdf: Array
+    start_cdf: Array
+    terminal: Array
+    reward_noise: Array
+
+
+class Acted(NamedTuple):
+    """New ``q[S, N, A]``, ``steps[S]`` taken, and a log ``[S, L]``; where not ``active``, it is zero."""
+
+    q: Array
+    steps: Array
+    observation: Array
+    action: Array
+    reward: Array
+    arrived: Array
+    active: Array
+    ended: Array
+    terminated: Array
+    best: Array
+
+
+def act(
+    model: ActingModel,
+    q: Array,
+    draws: Array,
+    level: Array,
+    world: WorldTables,
+    settings: Array,
+    *,
+    replacing: bool,
+    rule: str,
+    exploration: str,
+) -> Acted:
+    """Run trials of ``S`` agents, each learning values on its way: ``agents.trial.run_trials``.
+
+    Args:
+        model: of each agent, or one (``M = 1``) that all share.
+        q: float32 ``[S, N, A]``.
+        draws: uniforms float32 ``[S, trials + 1, limit + 1, 6]``: three for the world, three for a choice.
+        level: float32 ``[S, trials * limit + 1]``, epsilon or temperature after so many more steps.
+        world: where they act.
+        settings: float32 ``[4]``: learning rate, discount, lambda, chance that exploring repeats the action.
+        replacing: kind of trace.
+        rule: ``sarsa`` or ``q``.
+        exploration: ``epsilon`` or ``boltzmann``.
+
+    Raises:
+        ValueError: an argument of another shape or dtype, or an unknown rule.
+    """
+    if rule not in RULES:
+        raise ValueError(f"rule must be one of {RULES}, got {rule!r}")
+    seeds, states, actions = jnp.shape(q)
+    trials, limit = draws.shape[1] - 1, draws.shape[2] - 1
+    models, symbols = model.log_obs.shape[:2]
+    _, places, outcomes = world.successors.shape
+    if models not in (1, seeds):
+        raise ValueError(f"model must have a leading axis of 1 or {seeds}, got {models}")
+    single = (
+        ("q", q, (seeds, states, actions)),
+        ("draws", draws, (seeds, trials + 1, limit + 1, 6)),
+        ("level", level, (seeds, trials * limit + 1)),
+        ("settings", settings, (4,)),
+        ("model.init", model.init, (models, states)),
+        ("model.trans", model.trans, (models, actions, states, states)),
+        ("model.log_obs", model.log_obs, (models, symbols, states)),
+        ("world.transition_cdf", world.transition_cdf, (actions, places, outcomes)),
+        ("world.reward", world.reward, (actions, places, outcomes)),
+        ("world.observation_cdf", world.observation_cdf, (world.observation_cdf.shape[0], places, symbols)),
+        ("world.first_observation_cdf", world.first_observation_cdf, (places, symbols)),
+        ("world.start_cdf", world.start_cdf, (places,)),
+        ("world.reward_noise", world.reward_noise, ()),
+    )
+    for name, array, shape in single:
+        _check(name, array, shape, jnp.float32)
+    _check("world.successors", world.successors, (actions, places, outcomes), jnp.int32)
+    _check("world.terminal", world.terminal, (places,), jnp.bool_)
+    whole, real, flag = (
+        (jax.ShapeDtypeStruct((seeds, trials * limit), t)) for t in ("int32", "float32", "bool")
+    )
+    steps = jax.ShapeDtypeStruct((seeds,), jnp.int32)
+    results = (*_float32(q.shape), steps, whole, whole, real, whole, flag, flag, flag, real)
+    call = jax.ffi.ffi_call("jaxpomdp_act", results, vmap_method="sequential")
+    flags = {"replacing": replacing, "greedy": rule == "q", "boltzmann": exploration == "boltzmann"}
+    return Acted(*call(*model, q, draws, level, *world, settings, **flags))

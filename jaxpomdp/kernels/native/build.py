@@ -26,6 +26,7 @@ TARGETS = {
     "jaxpomdp_estep": "JaxpomdpEstep",
     "jaxpomdp_filter": "JaxpomdpFilter",
     "jaxpomdp_replay": "JaxpomdpReplay",
+    "jaxpomdp_act": "JaxpomdpAct",
 }
 """Names of the custom calls, and the symbols that serve them."""
 

@@ -1,9 +1,9 @@
-// Expected counts, filtering and SARSA replay on the CPU, behind JAX's foreign function interface.
+// Expected counts, filtering, acting and SARSA replay on the CPU, behind JAX's foreign function interface.
 //
 // Rows of one model run in step: at each time the rows that took the same action share one small matrix
 // product, and the expected transitions are one product per action over blocks of steps. Probabilities are
 // renormalised at every step; a row where underflow mattered is done again in logarithms and double precision.
-// The semantics are those of kernels/smoothing.py and kernels/filtering.py, which are the tests' oracle.
+// The semantics are those of kernels/smoothing.py, kernels/filtering.py and agents/trial.py, the tests' oracles.
 
 #include <algorithm>
 #include <cstdint>
@@ -11,6 +11,7 @@
 #include <new>
 #include <vector>
 
+#include "act.h"
 #include "exact.h"
 #include "replay.h"
 #include "tapes.h"
@@ -32,7 +33,8 @@ struct Call {
   const float* floats(size_t i) const { return static_cast<const float*>(in(i).untyped_data()); }
   const int32_t* ints(size_t i) const { return static_cast<const int32_t*>(in(i).untyped_data()); }
   const bool* flags(size_t i) const { return static_cast<const bool*>(in(i).untyped_data()); }
-  float* result(size_t i) const { return static_cast<float*>(out(i).untyped_data()); }
+  template <class T = float>
+  T* result(size_t i) const { return static_cast<T*>(out(i).untyped_data()); }
 };
 
 ffi::Error done(bool fine) { return fine ? ffi::Error::Success() : ffi::Error::Internal("jaxpomdp: out of memory"); }
@@ -123,6 +125,31 @@ ffi::Error replay(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Diction
   }));
 }
 
+// A model, values, draws and levels, a world, settings; results: the new q, steps taken, and the log.
+ffi::Error act(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary choices) {
+  const Call call{args, rets};
+  const auto q = call.in(3).dimensions(), draws = call.in(4).dimensions(), world = call.in(7).dimensions();
+  Acting w{};
+  w.S = q[0], w.models = call.in(0).dimensions()[0], w.N = q[1], w.A = q[2], w.O = call.in(2).dimensions()[1];
+  w.X = world[1], w.K = world[2], w.trials = draws[1] - 1, w.limit = draws[2] - 1, w.noted = w.trials * w.limit;
+  w.init = call.floats(0), w.trans = call.floats(1), w.log_obs = call.floats(2), w.q = call.floats(3);
+  w.draws = call.floats(4), w.level = call.floats(5), w.successors = call.ints(6);
+  w.transition_cdf = call.floats(7), w.reward = call.floats(8), w.observation_cdf = call.floats(9);
+  w.first_cdf = call.floats(10), w.start_cdf = call.floats(11), w.terminal = call.flags(12);
+  w.reward_noise = *call.floats(13), w.settings = call.floats(14);
+  w.seen_by_action = call.in(9).dimensions()[0] > 1;
+  w.replacing = *choices.get<bool>("replacing"), w.greedy_rule = *choices.get<bool>("greedy");
+  w.boltzmann = *choices.get<bool>("boltzmann");
+  w.learnt = call.result(0), w.steps = call.result<int32_t>(1);
+  w.observation = call.result<int32_t>(2), w.action = call.result<int32_t>(3), w.paid = call.result(4);
+  w.arrived = call.result<int32_t>(5), w.active = call.result<bool>(6), w.ended = call.result<bool>(7);
+  w.terminated = call.result<bool>(8), w.best = call.result(9);
+  for (size_t i = 1; i < 10; ++i) std::memset(call.out(i).untyped_data(), 0, call.out(i).size_bytes());
+  return done(parallel(w.S, useful_threads(1.0 * w.S * w.trials * (w.N + 32) * w.N), [&] {
+    return [player = std::make_shared<Player>(w)](Index seed) { player->play(seed); };
+  }));
+}
+
 auto binding() { return ffi::Ffi::Bind().RemainingArgs().RemainingRets().Attrs(); }
 
 }  // namespace
@@ -130,3 +157,4 @@ auto binding() { return ffi::Ffi::Bind().RemainingArgs().RemainingRets().Attrs()
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpFilter, filter_tapes, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpEstep, estep, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpReplay, replay, binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpAct, act, binding());
