@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ import numpy as np
 from jaxpomdp import packing
 from jaxpomdp._types import Array
 from jaxpomdp.agents import experience, learner
+from jaxpomdp.agents.clock import Clock
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.experience import Experience
 from jaxpomdp.agents.learner import LearnerConfig
@@ -44,11 +44,12 @@ class AgentConfig:
 
 
 class Best(NamedTuple):
-    """The best policy so far: its models, its values, and its average discounted reward ``[S]``."""
+    """The best policy so far: its models, its values, its average discounted reward ``[S]`` and error."""
 
     params: Any
     q: Array
     score: np.ndarray
+    error: np.ndarray
 
 
 class AgentState(NamedTuple):
@@ -108,7 +109,7 @@ class Agent:
             store,
             np.zeros(params.alive.shape, np.int64),
             np.full((len(seeds), kept), np.nan),
-            Best(params, q, np.full(len(seeds), -np.inf)),
+            Best(params, q, np.full(len(seeds), -np.inf), np.zeros(len(seeds))),
         )
 
     def _start(self, seeds: np.ndarray) -> tuple[Any, Array]:
@@ -134,7 +135,7 @@ class Agent:
             per seed ``states``, ``log_evidence``, ``epsilon`` and seconds spent ``acting``, ``fitting``,
             ``structure``, ``replaying`` (the same for all seeds).
         """
-        settings, clock = self.config.learner, _Clock()
+        settings, clock = self.config.learner, Clock()
         trials = settings.trials_per_phase if settings else 50
         actor, log, count = run_trials(
             self.family, self.config.control, self.world, state.params, state.actor, trials=trials
@@ -149,7 +150,7 @@ class Agent:
             state, evidence = self._learn(state, clock)
         return state, rows | self._phase_rows(state, evidence, clock)
 
-    def _phase_rows(self, state: AgentState, evidence: np.ndarray, clock: _Clock) -> dict[str, np.ndarray]:
+    def _phase_rows(self, state: AgentState, evidence: np.ndarray, clock: Clock) -> dict[str, np.ndarray]:
         level = self.config.control.schedule.function()(state.actor.steps)
         seconds = {name: np.full(len(evidence), spent) for name, spent in clock.spent.items()}
         return {
@@ -164,15 +165,16 @@ class Agent:
             return state
         width = state.recent.shape[1]
         recent = np.concatenate([state.recent, discounted], axis=1)[:, -width:]
-        average = np.where(np.isnan(recent).any(axis=1), -np.inf, np.mean(np.nan_to_num(recent), axis=1))
-        better = average > state.best.score
+        average, error = _mean_and_error(recent)
+        better = np.where(np.isnan(average), -np.inf, average) > state.best.score
         score = np.where(better, average, state.best.score)
+        error = np.where(better, error, state.best.error)
         best = learner.select(
             jnp.asarray(better), (state.params, state.actor.q), (state.best.params, state.best.q)
         )
-        return state._replace(recent=recent, best=Best(best[0], best[1], score))
+        return state._replace(recent=recent, best=Best(best[0], best[1], score, error))
 
-    def _learn(self, state: AgentState, clock: _Clock) -> tuple[AgentState, np.ndarray]:
+    def _learn(self, state: AgentState, clock: Clock) -> tuple[AgentState, np.ndarray]:
         settings = self.config.learner
         tapes = experience.tapes_of(state.experience)
         batch = jax.device_put(tapes.batch)
@@ -260,10 +262,10 @@ class Agent:
         if capacity > best.params.alive.shape[1]:
             old = packing.unpack_all(best.params)
             kept_q = packing.carry(best.q, [np.arange(spec.num_states) for spec in old], capacity)
-            best = Best(packing.pack(old, capacity), kept_q, best.score)
+            best = best._replace(params=packing.pack(old, capacity), q=kept_q)
         return state._replace(params=params, actor=replace(state.actor, q=q), rest=rest, best=best), grew
 
-    def _replay(self, state: AgentState, batch: Any, clock: _Clock) -> AgentState:
+    def _replay(self, state: AgentState, batch: Any, clock: Clock) -> AgentState:
         settings, control = self.config.learner, self.config.control
         if not settings.replay_passes:
             return state
@@ -291,28 +293,20 @@ class Agent:
         return summarise(experience.split_log(log, int(count)), self.world)
 
     def finish(self, state: AgentState) -> AgentState:
-        """Return the agent as it ends: where an earlier policy was better on average, that one."""
-        if not (self.config.learner and self.config.learner.keep_best):
+        """Return the agent as it ends: where an earlier policy was clearly better on average, that one."""
+        settings = self.config.learner
+        if not (settings and settings.keep_best):
             return state
-        now = np.mean(state.recent, axis=1)
-        worse = jnp.asarray(state.best.score > now)
-        params, q = learner.select(worse, (state.best.params, state.best.q), (state.params, state.actor.q))
+        now, error = _mean_and_error(state.recent)
+        worse = state.best.score - now > settings.revert_margin * np.hypot(error, state.best.error)
+        kept = (state.best.params, state.best.q)
+        params, q = learner.select(jnp.asarray(worse), kept, (state.params, state.actor.q))
         return state._replace(params=params, actor=replace(state.actor, q=q))
 
 
-class _Clock:
-    """Seconds spent by name."""
-
-    def __init__(self) -> None:
-        self.spent = dict.fromkeys(("acting", "fitting", "structure", "replaying"), 0.0)
-        self._last = time.perf_counter()
-
-    def lap(self, name: str, after: Any = None) -> None:
-        """Charge the time since the last lap to ``name``, once ``after`` is computed."""
-        jax.block_until_ready(after)
-        now = time.perf_counter()
-        self.spent[name] += now - self._last
-        self._last = now
+def _mean_and_error(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of each row and its standard error, NaN for a row that is not full."""
+    return rows.mean(axis=1), rows.std(axis=1) / np.sqrt(rows.shape[1])
 
 
 def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.ndarray]:

@@ -18,6 +18,7 @@ from jaxpomdp._types import Array
 from jaxpomdp.agents import agent as agents
 from jaxpomdp.agents import control, experience, learner
 from jaxpomdp.agents.agent import Agent, AgentConfig, AgentState, Best
+from jaxpomdp.agents.clock import Clock
 from jaxpomdp.agents.control import Schedule
 from jaxpomdp.agents.experience import Trials
 from jaxpomdp.agents.gym_play import play
@@ -74,7 +75,7 @@ class _Learner(Agent):
         self, state: AgentState, actor: Actor, new: list[Trials]
     ) -> tuple[AgentState, dict[str, np.ndarray]]:
         """Remember new trials, and learn from the past where a phase is complete."""
-        clock, was_blind = agents._Clock(), self.blind(state)
+        clock, was_blind = Clock(), self.blind(state)
         rows = agents.summarise(new, self.world)
         state = state._replace(actor=actor, experience=experience.remember(state.experience, new))
         evidence = np.zeros(len(new))
@@ -108,7 +109,7 @@ class _Learner(Agent):
         ]
         params = starts.stack_models(models)
         q = jnp.full_like(state.actor.q, control_settings.optimism)
-        best = Best(params, q, np.full(len(seeds), -np.inf))
+        best = Best(params, q, np.full(len(seeds), -np.inf), np.zeros(len(seeds)))
         return state._replace(params=params, actor=replace(state.actor, q=q), best=best)
 
 

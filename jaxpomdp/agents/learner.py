@@ -66,6 +66,8 @@ class LearnerConfig:
     """How many of the latest trials the gate looks at."""
     keep_best: int = 200
     """Return at the end to the policy that was best on average over so many trials (0: keep the last)."""
+    revert_margin: float = 1.0
+    """... if that average was better than the last one by more than so many standard errors."""
     bins: int = 64
     """Bins of the return histograms."""
     prior: Prior = field(default_factory=Prior)

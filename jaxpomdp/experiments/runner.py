@@ -148,7 +148,8 @@ class _Session:
         trials, phase = _split(rows)
         after = before + trials["steps"].shape[1]
         due = _due(before, after, self.config.evaluate_every)
-        judged = self._judge(state, after, self.config.evaluation_trials) if due else None
+        ending = self.agent.finish(state) if due else None
+        judged = self._judge(ending, after, self.config.evaluation_trials) if due else None
         self.state, self.trial = state, after
         self._note(before, trials, phase)
         if judged is not None:

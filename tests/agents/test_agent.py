@@ -150,6 +150,19 @@ def test_finish_goes_back_where_an_earlier_policy_was_better(run):
     np.testing.assert_array_equal(ended.params.log_trans[1], state.params.log_trans[1])
 
 
+def test_finish_stays_where_the_difference_may_be_chance(run):
+    state = run.states[-1]
+    recent = np.tile([0.0, 2.0], (3, 3))
+    best = state.best._replace(
+        score=recent.mean(axis=1) + np.array([0.5, 0.65, 0.5]),
+        q=state.actor.q + 1,
+        error=np.array([0.4, 0.4, 0]),
+    )
+    ended = run.agent.finish(state._replace(best=best, recent=recent))
+    moved = np.asarray(ended.actor.q - state.actor.q > 0.5).reshape(3, -1).all(axis=1)
+    np.testing.assert_array_equal(moved, [False, True, True])
+
+
 def test_an_unfinished_average_is_no_reason_to_go_back(run):
     ended = run.agent.finish(run.states[0])
     assert_equal(ended, run.states[0])
