@@ -43,8 +43,13 @@ format: $(VENV)/.ready-dev  ## rewrite the code in the usual format
 reproduce: $(VENV)/.ready-demo  ## the thesis's tables and figures: make reproduce NAME=table-3.1
 	$(BIN)/jaxpomdp reproduce $(NAME)
 
-bench: $(VENV)/.ready-dev  ## speed, beside other libraries
-	for script in benchmarks/speed/*.py; do $(BIN)/python "$$script" || exit 1; done
+$(VENV)-bench/.ready: $(SETUP) benchmarks/speed/requirements.txt
+	@tools/make_venv.sh $(VENV)-bench cli,plots
+	@$(VENV)-bench/bin/python -m pip install --quiet --disable-pip-version-check -r benchmarks/speed/requirements.txt
+	@touch $@
+
+bench: $(VENV)-bench/.ready  ## speed, beside other libraries, in an environment of its own (half an hour)
+	$(VENV)-bench/bin/python benchmarks/speed/bench.py
 
 build: $(VENV)/.ready-dev  ## the wheel and the source archive, in dist/
 	$(BIN)/python -m build
@@ -54,4 +59,4 @@ constraints: $(VENV)/.ready-dev  ## pin the newest versions that fit together
 	mv constraints.new constraints.txt
 
 clean:  ## remove what the targets made
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-bench build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
