@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxpomdp.models.coupled import CoupledParams, Strand
 from jaxpomdp.models.emission import Categorical, DiagonalGaussian, ReturnModel
 from jaxpomdp.models.flat import FlatParams
 from jaxpomdp.models.full_gaussian import FullGaussian
@@ -28,7 +29,8 @@ from jaxpomdp.models.full_gaussian import FullGaussian
 FORMAT = "jaxpomdp.params"
 VERSION = 1
 KINDS: dict[str, type] = {
-    cls.__name__: cls for cls in (FlatParams, Categorical, DiagonalGaussian, FullGaussian, ReturnModel)
+    cls.__name__: cls
+    for cls in (FlatParams, CoupledParams, Strand, Categorical, DiagonalGaussian, FullGaussian, ReturnModel)
 }
 """The classes that files may name. Other families add theirs with ``register``."""
 _NUMBERS = "biuf"
