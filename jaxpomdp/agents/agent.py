@@ -15,7 +15,9 @@ import numpy as np
 
 from jaxpomdp import packing
 from jaxpomdp._types import Array
+from jaxpomdp.agents import best as keeping
 from jaxpomdp.agents import experience, learner
+from jaxpomdp.agents.best import Best
 from jaxpomdp.agents.clock import Clock
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.experience import Experience
@@ -41,15 +43,6 @@ class AgentConfig:
     """How actions are chosen and valued."""
     learner: LearnerConfig | None = field(default_factory=LearnerConfig)
     """How the model is learned."""
-
-
-class Best(NamedTuple):
-    """The best policy so far: its models, its values, its average discounted reward ``[S]`` and error."""
-
-    params: Any
-    q: Array
-    score: np.ndarray
-    error: np.ndarray
 
 
 class AgentState(NamedTuple):
@@ -109,15 +102,15 @@ class Agent:
             store,
             np.zeros(params.alive.shape, np.int64),
             np.full((len(seeds), kept), np.nan),
-            Best(params, q, np.full(len(seeds), -np.inf), np.zeros(len(seeds))),
+            keeping.none_yet(params, q),
         )
 
-    def _start(self, seeds: np.ndarray) -> tuple[Any, Array]:
+    def _start(self, seeds: np.ndarray, capacity: int = 0) -> tuple[Any, Array]:
         if self.fixed is not None:
             return self.fixed(seeds)
         settings = self.config.learner
         make = starts.observation_seeded if settings.initial == "observation" else starts.random_params
-        capacity = self._capacity(settings.states)
+        capacity = max(self._capacity(settings.states), capacity)
         sizes = (settings.states, self.world.num_actions, self.world.num_observations)
         options = {"by_action": settings.return_by_action, "capacity": capacity}
         params = starts.stack_models([make(int(seed), *sizes, **options) for seed in seeds])
@@ -163,16 +156,10 @@ class Agent:
         """Note how the latest trials went, and keep a copy of the policy that did best on average."""
         if not (self.config.learner and self.config.learner.keep_best):
             return state
-        width = state.recent.shape[1]
+        width, trials = state.recent.shape[1], discounted.shape[1]
         recent = np.concatenate([state.recent, discounted], axis=1)[:, -width:]
-        average, error = _mean_and_error(recent)
-        better = np.where(np.isnan(average), -np.inf, average) > state.best.score
-        score = np.where(better, average, state.best.score)
-        error = np.where(better, error, state.best.error)
-        best = learner.select(
-            jnp.asarray(better), (state.params, state.actor.q), (state.best.params, state.best.q)
-        )
-        return state._replace(recent=recent, best=Best(best[0], best[1], score, error))
+        best = keeping.judged(state.best, recent, state.params, state.actor.q, trials)
+        return state._replace(recent=recent, best=best)
 
     def _learn(self, state: AgentState, clock: Clock) -> tuple[AgentState, np.ndarray]:
         settings = self.config.learner
@@ -182,6 +169,7 @@ class Agent:
         batch = learner.with_returns(batch, jnp.asarray(tapes.tail), **options)
         held = self._held(state)
         refit = partial(learner.refit, self.family, config=learner.em_config(settings))
+        state = self._restarted(state, held)
         params, evidence = state.params, np.zeros(len(held))
         if settings.em_iterations and not held.all():
             params, found = refit(params, batch, jnp.asarray(held), iterations=settings.em_iterations)
@@ -194,6 +182,27 @@ class Agent:
             state = state._replace(params=params)
         clock.lap("fitting", after=state.params)
         return self._replay(state, batch, clock), evidence
+
+    def _restarted(self, state: AgentState, held: np.ndarray) -> AgentState:
+        """Where the best policy is old go back to it, or, where it is no better than now, begin again."""
+        patience, best = self.config.learner.patience, state.best
+        age = np.where(held, 0, best.age)
+        stale = (age >= patience) & bool(patience)
+        if not stale.any():
+            return state._replace(best=best._replace(age=age))
+        lost = keeping.clearly_worse(best, state.recent, keeping.SURE)
+        again = zip(np.asarray(state.actor.keys[:, -1]), np.asarray(state.actor.trials), strict=True)
+        seeds = np.array([np.random.SeedSequence(pair).generate_state(1)[0] for pair in again])
+        fresh = self._start(seeds, state.params.alive.shape[1])
+        onward = keeping.select(lost, (best.params, best.q), fresh)
+        params, q = keeping.select(stale, onward, (state.params, state.actor.q))
+        return state._replace(
+            params=params,
+            actor=replace(state.actor, q=q),
+            rest=np.where(stale[:, None], 0, state.rest),
+            recent=np.where(stale[:, None], np.nan, state.recent),
+            best=best._replace(age=np.where(stale, 0, age)),
+        )
 
     def _held(self, state: AgentState) -> np.ndarray:
         """Say which seeds do too well to touch their model: ``std / |mean|`` of start returns is low."""
@@ -297,16 +306,10 @@ class Agent:
         settings = self.config.learner
         if not (settings and settings.keep_best):
             return state
-        now, error = _mean_and_error(state.recent)
-        worse = state.best.score - now > settings.revert_margin * np.hypot(error, state.best.error)
+        worse = keeping.clearly_worse(state.best, state.recent, settings.revert_margin)
         kept = (state.best.params, state.best.q)
-        params, q = learner.select(jnp.asarray(worse), kept, (state.params, state.actor.q))
+        params, q = keeping.select(worse, kept, (state.params, state.actor.q))
         return state._replace(params=params, actor=replace(state.actor, q=q))
-
-
-def _mean_and_error(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of each row and its standard error, NaN for a row that is not full."""
-    return rows.mean(axis=1), rows.std(axis=1) / np.sqrt(rows.shape[1])
 
 
 def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.ndarray]:

@@ -17,7 +17,8 @@ import numpy as np
 from jaxpomdp._types import Array
 from jaxpomdp.agents import agent as agents
 from jaxpomdp.agents import control, experience, learner
-from jaxpomdp.agents.agent import Agent, AgentConfig, AgentState, Best
+from jaxpomdp.agents.agent import Agent, AgentConfig, AgentState
+from jaxpomdp.agents.best import none_yet
 from jaxpomdp.agents.clock import Clock
 from jaxpomdp.agents.control import Schedule
 from jaxpomdp.agents.experience import Trials
@@ -109,7 +110,7 @@ class _Learner(Agent):
         ]
         params = starts.stack_models(models)
         q = jnp.full_like(state.actor.q, control_settings.optimism)
-        best = Best(params, q, np.full(len(seeds), -np.inf), np.zeros(len(seeds)))
+        best = none_yet(params, q)
         return state._replace(params=params, actor=replace(state.actor, q=q), best=best)
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array, Posterior, TrialBatch
+from jaxpomdp.agents.best import select
 from jaxpomdp.agents.control import ControlConfig
 from jaxpomdp.agents.trial import memory_of
 from jaxpomdp.kernels import native
@@ -68,6 +69,9 @@ class LearnerConfig:
     """Return at the end to the policy that was best on average over so many trials (0: keep the last)."""
     revert_margin: float = 1.0
     """... if that average was better than the last one by more than so many standard errors."""
+    patience: int = 0
+    """After so many trials without a better average, those held back by the gate not counted, go back to the
+    best policy, or, where it is no better than the one of now, begin again with a new model (0: never)."""
     bins: int = 64
     """Bins of the return histograms."""
     prior: Prior = field(default_factory=Prior)
@@ -126,11 +130,6 @@ def refit(
 
     fitted, evidence = jax.lax.scan(iterate, params, None, length=iterations)
     return select(held, params, fitted), evidence[-1]
-
-
-def select(mask: Array, yes: Any, no: Any) -> Any:
-    """Take each model (leading ``S``) from ``yes`` where ``mask[S]``, else from ``no``."""
-    return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, y), yes, no)
 
 
 @partial(jax.jit, static_argnames=("family", "config", "bins", "by_trial"))

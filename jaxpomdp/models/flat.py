@@ -1,9 +1,14 @@
-"""The flat action-conditioned hidden Markov model (thesis section 3.3): ``FLAT`` and its parameters."""
+"""The flat action-conditioned hidden Markov model (thesis section 3.3): ``FLAT`` and its parameters.
+
+``chain_family`` makes the family of any model whose production states emit and earn as the flat ones do and
+whose transitions come from two tables of probability rows; the flat model is the plainest of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -15,7 +20,7 @@ from jaxpomdp.kernels.emissions import tempered, unless_missing
 from jaxpomdp.models import estimates
 from jaxpomdp.models.checks import check
 from jaxpomdp.models.emission import GaussianStatistics, ReturnModel
-from jaxpomdp.models.family import Family, Prior
+from jaxpomdp.models.family import PARTS, Family, Prior
 from jaxpomdp.numerics import NEG
 
 
@@ -47,31 +52,43 @@ class FlatStatistics(NamedTuple):
     returns: GaussianStatistics
 
 
-def _mask(params: FlatParams, log_density: Array) -> Array:
+class Tables(NamedTuple):
+    """How a model's chain is made of two tables of log-probability rows (last axis).
+
+    Parameters have the leaves ``emissions``, ``returns`` and ``alive`` of ``FlatParams`` besides.
+
+    Attributes:
+        names: the parameters' fields that hold the tables of the parts "init" and "transitions".
+        chain: ``params -> Chain``.
+        rows: ``params -> (init, transitions)``, the tables with ``NEG`` wherever nothing can go.
+        counts: ``(params, statistics) -> (init, transitions)``, how often each entry was used.
+    """
+
+    names: tuple[str, str]
+    chain: Callable[[Any], Chain]
+    rows: Callable[[Any], tuple[Array, Array]]
+    counts: Callable[[Any, FlatStatistics], tuple[Array, Array]]
+
+
+def _mask(params: Any, log_density: Array) -> Array:
     return jnp.where(jnp.broadcast_to(params.alive, log_density.shape), log_density, NEG)
 
 
-def _acting(params: FlatParams) -> Chain:
-    alive = params.alive
-    both = alive[:, None] & alive[None, :]
-    return Chain(_mask(params, params.log_init), jnp.where(both[None], params.log_trans, NEG))
-
-
-def _observation_density(params: FlatParams, observations: tuple[Array, ...], observed: Array) -> Array:
+def _observation_density(params: Any, observations: tuple[Array, ...], observed: Array) -> Array:
     total = sum(channel.log_density(x) for channel, x in zip(params.emissions, observations, strict=True))
     return unless_missing(total, observed)
 
 
-def _log_obs(params: FlatParams, observations: tuple[Array, ...], observed: Array) -> Array:
+def _log_obs(params: Any, observations: tuple[Array, ...], observed: Array) -> Array:
     return _mask(params, _observation_density(params, observations, observed))
 
 
-def _learning(params: FlatParams, batch: TrialBatch, theta: float) -> tuple[Chain, Array]:
+def _learning(tables: Tables, params: Any, batch: TrialBatch, theta: float) -> tuple[Chain, Array]:
     log_obs = _observation_density(params, batch.observations, batch.observed)
     if theta != 0:
         log_return = params.returns.log_density(batch.returns, batch.actions)
         log_obs = tempered(log_obs, log_return, theta, batch.has_return)
-    return _acting(params), _mask(params, log_obs)
+    return tables.chain(params), _mask(params, log_obs)
 
 
 def _masks(batch: TrialBatch) -> tuple[Array, Array]:
@@ -79,16 +96,16 @@ def _masks(batch: TrialBatch) -> tuple[Array, Array]:
     return batch.observed & batch.valid, batch.has_return & batch.valid
 
 
-def _feasible(params: FlatParams, batch: TrialBatch, prior: Prior, carry: Any) -> FlatParams:
+def _feasible(tables: Tables, params: Any, batch: TrialBatch, prior: Prior, carry: Any) -> Any:
     seen, paid = _masks(batch)
     carried = (None,) * len(params.emissions) if carry is None else carry.emissions
     channels = zip(params.emissions, batch.observations, carried, strict=True)
     emissions = tuple(channel.feasible(x, seen, prior, extra) for channel, x, extra in channels)
     returns = params.returns.feasible(batch.returns, paid, prior, None if carry is None else carry.returns)
-    return _frozen(params, replace(params, emissions=emissions, returns=returns), prior)
+    return _frozen(tables, params, replace(params, emissions=emissions, returns=returns), prior)
 
 
-def _statistics(params: FlatParams, batch: TrialBatch, posterior: Posterior) -> FlatStatistics:
+def _statistics(params: Any, batch: TrialBatch, posterior: Posterior) -> FlatStatistics:
     (seen, paid), gamma = _masks(batch), posterior.gamma
     channels = list(zip(params.emissions, batch.observations, strict=True))
     features = [channel.features(x, seen) for channel, x in channels]
@@ -103,7 +120,7 @@ def _statistics(params: FlatParams, batch: TrialBatch, posterior: Posterior) -> 
     return FlatStatistics(posterior.initial, posterior.xi, emissions, returns)
 
 
-def _keep_absent(params: FlatParams, old: Any, new: Any) -> Any:
+def _keep_absent(params: Any, old: Any, new: Any) -> Any:
     """Take the new rows of the states that exist, and the old rows of spare capacity."""
 
     def keep(x: Array, y: Array) -> Array:
@@ -112,101 +129,127 @@ def _keep_absent(params: FlatParams, old: Any, new: Any) -> Any:
     return jax.tree.map(keep, old, new)
 
 
-def _m_step(params: FlatParams, statistics: FlatStatistics, prior: Prior) -> FlatParams:
-    chain = _acting(params)
+def _m_step(tables: Tables, params: Any, statistics: FlatStatistics, prior: Prior) -> Any:
     pairs = zip(params.emissions, statistics.emissions, strict=True)
     emissions = tuple(channel.updated(counts, prior) for channel, counts in pairs)
     returns = params.returns.updated(statistics.returns, prior)
-    new = FlatParams(
-        estimates.dirichlet_mode(chain.log_init, statistics.initial, prior.initial),
-        estimates.dirichlet_mode(chain.log_trans, statistics.transitions, prior.transition),
-        _keep_absent(params, params.emissions, emissions),
-        _keep_absent(params, params.returns, returns),
-        params.alive,
+    counted = zip(tables.rows(params), tables.counts(params, statistics), _pseudo(prior), strict=True)
+    rows = [estimates.dirichlet_mode(old, counts, pseudo) for old, counts, pseudo in counted]
+    return _renewed(tables, params, rows, emissions, returns, prior)
+
+
+def _pseudo(prior: Prior) -> tuple[float, float]:
+    return prior.initial, prior.transition
+
+
+def _renewed(
+    tables: Tables,
+    old: Any,
+    rows: list[Array],
+    emissions: tuple[Any, ...],
+    returns: ReturnModel,
+    prior: Prior,
+) -> Any:
+    """Put new rows, channels and returns in, but for absent states and what the prior freezes."""
+    new = replace(
+        old,
+        emissions=_keep_absent(old, old.emissions, emissions),
+        returns=_keep_absent(old, old.returns, returns),
+        **dict(zip(tables.names, rows, strict=True)),
     )
-    return _frozen(params, new, prior)
+    return _frozen(tables, old, new, prior)
 
 
-def _frozen(old: FlatParams, new: FlatParams, prior: Prior) -> FlatParams:
+def _frozen(tables: Tables, old: Any, new: Any, prior: Prior) -> Any:
     """Put back the parts that the prior freezes."""
-    fields = {"init": "log_init", "transitions": "log_trans", "emissions": "emissions", "returns": "returns"}
+    fields = dict(zip(PARTS, (*tables.names, "emissions", "returns"), strict=True))
     return replace(new, **{fields[part]: getattr(old, fields[part]) for part in prior.freeze})
 
 
-def _chain_score(chain: Chain, initial: float | Array, transitions: float | Array) -> Array:
-    rows = estimates.dirichlet_score(chain.log_trans, transitions)
-    return estimates.dirichlet_score(chain.log_init, initial) + jnp.sum(rows)
+def _score(params: Any, rows: Iterable[Array], emissions: Iterable[Array], returns: Array) -> Array:
+    per_state = jnp.sum(jnp.where(params.alive, sum(emissions) + returns, 0))
+    return sum((jnp.sum(row) for row in rows), per_state)
 
 
-def _score(params: FlatParams, chain_score: Array, emissions: Iterable[Array], returns: Array) -> Array:
-    return chain_score + jnp.sum(jnp.where(params.alive, sum(emissions) + returns, 0))
-
-
-def _log_prior(params: FlatParams, statistics: FlatStatistics, prior: Prior, theta: float) -> Array:
-    chain = _acting(params)
-    rows = _chain_score(chain, prior.initial, prior.transition)
+def _log_prior(tables: Tables, params: Any, statistics: FlatStatistics, prior: Prior, theta: float) -> Array:
+    pseudo = zip(tables.rows(params), _pseudo(prior), strict=True)
+    rows = [estimates.dirichlet_score(row, count) for row, count in pseudo]
     pairs = zip(params.emissions, statistics.emissions, strict=True)
     emissions = [channel.log_prior(counts, prior) for channel, counts in pairs]
-    returns = theta * params.returns.log_prior(statistics.returns, prior)
-    return _score(params, rows, emissions, returns)
+    return _score(params, rows, emissions, theta * params.returns.log_prior(statistics.returns, prior))
 
 
-def _expected(params: FlatParams, statistics: FlatStatistics, theta: float) -> Array:
-    chain = _acting(params)
-    rows = _chain_score(chain, statistics.initial, statistics.transitions)
+def _expected(tables: Tables, params: Any, statistics: FlatStatistics, theta: float) -> Array:
+    counted = zip(tables.chain(params), (statistics.initial, statistics.transitions), strict=True)
+    rows = [estimates.dirichlet_score(row, counts) for row, counts in counted]
     pairs = zip(params.emissions, statistics.emissions, strict=True)
     emissions = [channel.expected(counts) for channel, counts in pairs]
-    returns = theta * params.returns.expected(statistics.returns)
-    return _score(params, rows, emissions, returns)
+    return _score(params, rows, emissions, theta * params.returns.expected(statistics.returns))
 
 
-def _to_free(params: FlatParams) -> dict[str, Any]:
+def _to_free(tables: Tables, params: Any) -> dict[str, Any]:
+    initial, transitions = (getattr(params, name) for name in tables.names)
     return {
-        "init": params.log_init,
-        "transitions": params.log_trans,
+        "init": initial,
+        "transitions": transitions,
         "emissions": tuple(channel.to_free() for channel in params.emissions),
         "returns": params.returns.to_free(),
     }
 
 
-def _from_free(params: FlatParams, free: dict[str, Any], prior: Prior) -> FlatParams:
-    chain = _acting(params)
+def _from_free(tables: Tables, params: Any, free: dict[str, Any], prior: Prior) -> Any:
     channels = zip(params.emissions, free["emissions"], strict=True)
     emissions = tuple(channel.from_free(leaves) for channel, leaves in channels)
-    new = FlatParams(
-        estimates.free_rows(chain.log_init, free["init"]),
-        estimates.free_rows(chain.log_trans, free["transitions"]),
-        _keep_absent(params, params.emissions, emissions),
-        _keep_absent(params, params.returns, params.returns.from_free(free["returns"])),
-        params.alive,
-    )
-    return _frozen(params, new, prior)
+    logits = zip(tables.rows(params), (free["init"], free["transitions"]), strict=True)
+    rows = [estimates.free_rows(old, new) for old, new in logits]
+    return _renewed(tables, params, rows, emissions, params.returns.from_free(free["returns"]), prior)
 
 
-def _count_free(params: FlatParams, prior: Prior, theta: float) -> Array:
-    chain = _acting(params)
+def _count_free(tables: Tables, params: Any, prior: Prior, theta: float) -> Array:
+    initial, transitions = (jnp.sum(estimates.count_free_entries(row)) for row in tables.rows(params))
     counts = {
-        "init": estimates.count_free_entries(chain.log_init),
-        "transitions": jnp.sum(estimates.count_free_entries(chain.log_trans)),
+        "init": initial,
+        "transitions": transitions,
         "emissions": jnp.sum(jnp.where(params.alive, sum(c.count_free() for c in params.emissions), 0)),
         "returns": jnp.sum(jnp.where(params.alive, params.returns.count_free(), 0)) * (theta > 0),
     }
     return jnp.asarray(sum(count for part, count in counts.items() if part not in prior.freeze))
 
 
-FLAT = Family(
-    name="flat",
-    acting=_acting,
-    log_obs=_log_obs,
-    learning=_learning,
-    feasible=_feasible,
-    statistics=_statistics,
-    m_step=_m_step,
-    log_prior=_log_prior,
-    expected=_expected,
-    to_free=_to_free,
-    from_free=_from_free,
-    count_free=_count_free,
-    check=check,
-)
+def chain_family(name: str, tables: Tables, check: Callable[..., None]) -> Family:
+    """Return the family of models of production states whose transitions come from two tables.
+
+    Args:
+        name: what the family is called in stored files.
+        tables: where the rows are, the chain that they make, and what of the statistics is theirs.
+        check: ``(params, batch) -> None``, as in ``Family``.
+    """
+    return Family(
+        name=name,
+        acting=tables.chain,
+        log_obs=_log_obs,
+        learning=partial(_learning, tables),
+        feasible=partial(_feasible, tables),
+        statistics=_statistics,
+        m_step=partial(_m_step, tables),
+        log_prior=partial(_log_prior, tables),
+        expected=partial(_expected, tables),
+        to_free=partial(_to_free, tables),
+        from_free=partial(_from_free, tables),
+        count_free=partial(_count_free, tables),
+        check=check,
+    )
+
+
+def _acting(params: FlatParams) -> Chain:
+    alive = params.alive
+    both = alive[:, None] & alive[None, :]
+    return Chain(_mask(params, params.log_init), jnp.where(both[None], params.log_trans, NEG))
+
+
+def _counts(params: FlatParams, statistics: FlatStatistics) -> tuple[Array, Array]:
+    return statistics.initial, statistics.transitions
+
+
+FLAT = chain_family("flat", Tables(("log_init", "log_trans"), _acting, _acting, _counts), check)
 """The flat model as a family."""

@@ -174,8 +174,8 @@ class FakeLog(NamedTuple):
 def test_a_log_is_cut_where_trials_ended():
     columns = [[1, 2, 5, 0], [3, 0, 1, 9], [0.5, 1, 2, 9], [2, 3, 6, 9]]
     flags = [[1, 1, 1, 0], [0, 1, 1, 0], [0, 1, 0, 1], [7, 8, 9, 9]]
-    log = FakeLog(*(np.array(c)[:, None] for c in columns), *(np.array(f, bool)[:, None] for f in flags[:3]),
-                  np.array(flags[3])[:, None])  # fmt: skip
+    columns = [np.array(values)[None] for values in columns]
+    log = FakeLog(*columns, *(np.array(flag, bool)[None] for flag in flags[:3]), np.array(flags[3])[None])
     (trials,) = experience.split_log(log, 4)
     np.testing.assert_array_equal(trials.lengths, [3, 2])
     np.testing.assert_array_equal(trials.observations[0], [1, 2, 3, 5, 6])

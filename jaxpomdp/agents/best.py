@@ -1,0 +1,72 @@
+"""The best policy so far: what is kept of it, and when an agent goes back to it.
+
+Policies are judged by the discounted reward of the trials that they were used in, exploration included, on
+average over a window of the latest trials; two averages differ clearly when they are further apart than some
+standard errors.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpomdp._types import Array
+
+SURE = 3.0
+"""Standard errors beyond which an agent goes back while it still learns."""
+
+ALIKE = 0.01
+"""Averages closer than this share of the best are alike: where nothing is left to chance, errors are zero."""
+
+
+class Best(NamedTuple):
+    """The best policy so far, for ``S`` seeds: its models and values, and how well it did.
+
+    ``score[S]`` is its average discounted reward (-inf: none yet), ``error[S]`` the standard error, and
+    ``age[S]`` the number of trials since then.
+    """
+
+    params: Any
+    q: Array
+    score: np.ndarray
+    error: np.ndarray
+    age: np.ndarray
+
+
+def none_yet(params: Any, q: Array) -> Best:
+    """Return what is kept before the first trial."""
+    seeds = len(q)
+    return Best(params, q, np.full(seeds, -np.inf), np.zeros(seeds), np.zeros(seeds, np.int64))
+
+
+def select(mask: Array, yes: Any, no: Any) -> Any:
+    """Take each model (leading ``S``) from ``yes`` where ``mask[S]``, else from ``no``."""
+    mask = jnp.asarray(mask)
+    return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, y), yes, no)
+
+
+def mean_and_error(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean of each row and its standard error, NaN for a row that is not full."""
+    return rows.mean(axis=1), rows.std(axis=1) / np.sqrt(rows.shape[1])
+
+
+def judged(best: Best, recent: np.ndarray, params: Any, q: Array, trials: int) -> Best:
+    """Keep the policy of now where the average of the ``recent[S, K]`` trials is the best so far."""
+    average, error = mean_and_error(recent)
+    better = np.where(np.isnan(average), -np.inf, average) > best.score
+    kept = select(better, (params, q), (best.params, best.q))
+    score, error = (np.where(better, x, y) for x, y in ((average, best.score), (error, best.error)))
+    return Best(*kept, score, error, np.where(better, 0, best.age + trials))
+
+
+def clearly_worse(best: Best, recent: np.ndarray, margin: float) -> np.ndarray:
+    """Say where the average of now is below the best one by more than ``margin`` standard errors.
+
+    Where too few trials were made since a new start, now counts as worse than any best there is.
+    """
+    now, error = mean_and_error(recent)
+    further = best.score - now > np.maximum(margin * np.hypot(error, best.error), ALIKE * np.abs(best.score))
+    return np.where(np.isnan(now), np.isfinite(best.score), further)
