@@ -21,15 +21,11 @@ from jaxpomdp.agents.best import Best
 from jaxpomdp.agents.clock import Clock
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.experience import Experience
+from jaxpomdp.agents.kinds import FlatModel, Room, Sizes, roomier, started
 from jaxpomdp.agents.learner import LearnerConfig
 from jaxpomdp.agents.trial import Actor, run_trials
 from jaxpomdp.envs.world import World
-from jaxpomdp.models import init as starts
-from jaxpomdp.models.family import Family
-from jaxpomdp.models.flat import FLAT
-from jaxpomdp.numerics import bucket
 from jaxpomdp.structure.policy import revise
-from jaxpomdp.structure.splits import STATE_SPLIT
 
 GREEDY = Schedule(0.0, 0.0, 1, "constant")
 """Exploration while an agent is judged."""
@@ -43,6 +39,8 @@ class AgentConfig:
     """How actions are chosen and valued."""
     learner: LearnerConfig | None = field(default_factory=LearnerConfig)
     """How the model is learned."""
+    model: Any = field(default_factory=FlatModel)
+    """What kind of model it is, with the settings of that kind."""
 
 
 class AgentState(NamedTuple):
@@ -65,8 +63,7 @@ class Agent:
 
     Args:
         world: where it acts.
-        config: its settings.
-        family: the kind of model.
+        config: its settings; ``config.model`` says which kind of model.
         fixed: ``(seeds) -> (params, q)`` with leading ``S``: a model that is given, and where values start;
             by default the model is learned from nothing.
 
@@ -74,10 +71,12 @@ class Agent:
         ValueError: neither a learner nor a model is given.
     """
 
-    def __init__(self, world: World, config: AgentConfig, family: Family = FLAT, fixed: Any = None) -> None:
+    def __init__(self, world: World, config: AgentConfig, fixed: Any = None) -> None:
         if config.learner is None and fixed is None:
             raise ValueError("config.learner must be given where no fixed model is, got None")
-        self.world, self.config, self.family, self.fixed = world, config, family, fixed
+        self.world, self.config, self.fixed = world, config, fixed
+        self.kind = config.model.kind()
+        self.family = self.kind.family
         self.log: list[dict[str, Any]] = []
         """A row for every structure edit made by this object."""
 
@@ -105,20 +104,13 @@ class Agent:
             keeping.none_yet(params, q),
         )
 
-    def _start(self, seeds: np.ndarray, capacity: int = 0) -> tuple[Any, Array]:
+    def _start(self, seeds: np.ndarray, least: Room | None = None) -> tuple[Any, Array]:
         if self.fixed is not None:
             return self.fixed(seeds)
-        settings = self.config.learner
-        make = starts.observation_seeded if settings.initial == "observation" else starts.random_params
-        capacity = max(self._capacity(settings.states), capacity)
-        sizes = (settings.states, self.world.num_actions, self.world.num_observations)
-        options = {"by_action": settings.return_by_action, "capacity": capacity}
-        params = starts.stack_models([make(int(seed), *sizes, **options) for seed in seeds])
-        shape = (len(seeds), capacity, self.world.num_actions)
+        sizes = Sizes(self.world.num_actions, self.world.num_observations)
+        params = started(self.kind, seeds, sizes, self.config.learner, least=least)
+        shape = (*params.alive.shape, self.world.num_actions)
         return params, jnp.full(shape, self.config.control.optimism, jnp.float32)
-
-    def _capacity(self, states: int) -> int:
-        return bucket(states, cap=max(self.config.learner.policy.node_cap, states))
 
     def run(self, state: AgentState) -> tuple[AgentState, dict[str, np.ndarray]]:
         """Do one round: a phase of trials, then what is learned from them.
@@ -193,7 +185,7 @@ class Agent:
         lost = keeping.clearly_worse(best, state.recent, keeping.SURE)
         again = zip(np.asarray(state.actor.keys[:, -1]), np.asarray(state.actor.trials), strict=True)
         seeds = np.array([np.random.SeedSequence(pair).generate_state(1)[0] for pair in again])
-        fresh = self._start(seeds, state.params.alive.shape[1])
+        fresh = self._start(seeds, self.kind.room_of(state.params))
         onward = keeping.select(lost, (best.params, best.q), fresh)
         params, q = keeping.select(stale, onward, (state.params, state.actor.q))
         return state._replace(
@@ -224,13 +216,8 @@ class Agent:
         alive = np.asarray(state.params.alive)
         if not due or not policy.edits_per_phase or (held | (alive.sum(-1) >= policy.node_cap)).all():
             return state, np.zeros(len(held), bool)
-        config = learner.em_config(settings)
-        by_trial = settings.split.count == "effective"
-        found = learner.gather_evidence(
-            self.family, state.params, batch, jnp.asarray(trial), config, settings.bins, by_trial
-        )
-        arrays = jax.device_get(found)
-        specs, origins, rests = packing.unpack_all(state.params), [], []
+        arrays = jax.device_get(self.kind.gather(state.params, batch, jnp.asarray(trial), settings))
+        specs, origins, rests = self.kind.unpack(state.params), [], []
         for s, spec in enumerate(specs):
             rest = state.rest[s, : spec.num_states]
             if held[s] or spec.num_states >= policy.node_cap:
@@ -240,11 +227,11 @@ class Agent:
             rng = np.random.default_rng((int(np.asarray(state.actor.keys)[s, -1]), phase))
             revision = revise(
                 spec,
-                learner.evidence_of_seed(arrays, s, alive[s]),
+                self.kind.evidence(arrays, s, spec),
                 phase=phase,
                 rest=rest,
                 policy=policy,
-                operators=((STATE_SPLIT, settings.split),),
+                operators=self.kind.operators(settings),
                 rng=rng,
             )
             specs[s] = revision.spec
@@ -260,18 +247,17 @@ class Agent:
         grew = np.array([len(origin) for origin in origins]) > before
         if not grew.any():
             return state, grew
-        capacity = max(self._capacity(spec.num_states) for spec in specs)
-        capacity = max(capacity, state.params.alive.shape[1])
-        params = packing.pack(specs, capacity)
-        q = packing.carry(state.actor.q, origins, capacity)
-        rest = np.zeros((len(rests), capacity), np.int64)
+        room = roomier(self.kind.room(self.config.learner, specs), self.kind.room_of(state.params))
+        params = self.kind.pack(specs, room)
+        q = packing.carry(state.actor.q, origins, room[0])
+        rest = np.zeros((len(rests), room[0]), np.int64)
         for row, kept in zip(rest, rests, strict=True):
             row[: len(kept)] = kept
         best = state.best
-        if capacity > best.params.alive.shape[1]:
-            old = packing.unpack_all(best.params)
-            kept_q = packing.carry(best.q, [np.arange(spec.num_states) for spec in old], capacity)
-            best = best._replace(params=packing.pack(old, capacity), q=kept_q)
+        if room != self.kind.room_of(best.params):
+            old = self.kind.unpack(best.params)
+            kept_q = packing.carry(best.q, [np.arange(spec.num_states) for spec in old], room[0])
+            best = best._replace(params=self.kind.pack(old, room), q=kept_q)
         return state._replace(params=params, actor=replace(state.actor, q=q), rest=rest, best=best), grew
 
     def _replay(self, state: AgentState, batch: Any, clock: Clock) -> AgentState:

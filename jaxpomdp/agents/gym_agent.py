@@ -24,11 +24,9 @@ from jaxpomdp.agents.control import Schedule
 from jaxpomdp.agents.experience import Trials
 from jaxpomdp.agents.gym_play import play
 from jaxpomdp.agents.gym_turns import SingleTurns, VectorTurns, turns_of
+from jaxpomdp.agents.kinds import Sizes, started
 from jaxpomdp.agents.trial import Actor, first_belief, memory_of, next_belief
 from jaxpomdp.envs.spaces import ChannelSpec, actions_of, channels_of, encode
-from jaxpomdp.models import init as starts
-from jaxpomdp.models.family import Family
-from jaxpomdp.models.flat import FLAT
 from jaxpomdp.models.init import Real
 
 RANDOM = Schedule(1.0, 1.0, 1, "constant")
@@ -53,8 +51,8 @@ class Interface(NamedTuple):
 class _Learner(Agent):
     """The offline phase of ``Agent``, for observations of several channels, discrete or real."""
 
-    def __init__(self, interface: Interface, config: AgentConfig, family: Family) -> None:
-        super().__init__(interface, config, family)
+    def __init__(self, interface: Interface, config: AgentConfig) -> None:
+        super().__init__(interface, config)
         self._interface = interface
 
     def init(self, seeds: Any) -> AgentState:
@@ -99,16 +97,9 @@ class _Learner(Agent):
             gamma=settings.return_gamma,
             bootstrap=False,
         )
-        host = jax.device_get(batch)
-        make = starts.observation_seeded if settings.initial == "observation" else starts.random_params
-        sizes = (settings.states, self._interface.num_actions, self._interface.num_observations)
-        options = {"by_action": settings.return_by_action, "capacity": self._capacity(settings.states)}
         seeds = np.asarray(state.actor.keys)[:, -1]
-        models = [
-            make(int(seed), *sizes, batch=jax.tree.map(lambda x, s=s: x[s], host), **options)
-            for s, seed in enumerate(seeds)
-        ]
-        params = starts.stack_models(models)
+        sizes = Sizes(self._interface.num_actions, self._interface.num_observations)
+        params = started(self.kind, seeds, sizes, settings, batch=jax.device_get(batch))
         q = jnp.full_like(state.actor.q, control_settings.optimism)
         best = none_yet(params, q)
         return state._replace(params=params, actor=replace(state.actor, q=q), best=best)
@@ -126,7 +117,6 @@ class GymAgent:
     Args:
         env: a single or a vector environment, or the pair of a single observation space and action space.
         config: all settings; ``control.gamma`` is also the discount of the reported ``discounted`` reward.
-        family: the kind of model.
 
     Attributes:
         state: everything that is learned, ``None`` before the first training; a pytree that can be stored.
@@ -141,12 +131,12 @@ class GymAgent:
         GymAgent(3 actions, observation[0]: 2 values, observation[1]: 2 values)
     """
 
-    def __init__(self, env: Any, config: AgentConfig = DEFAULT, family: Family = FLAT) -> None:
+    def __init__(self, env: Any, config: AgentConfig = DEFAULT) -> None:
         self._space, action_space = _spaces_of(env)
         self._actions = actions_of(action_space)
         self._channels = channels_of(self._space)
         sizes = tuple(c.size if c.kind == "categorical" else Real(c.size) for c in self._channels)
-        self._learner = _Learner(Interface(self._actions.count, sizes, config.control.gamma), config, family)
+        self._learner = _Learner(Interface(self._actions.count, sizes, config.control.gamma), config)
         self.state: AgentState | None = None
         self._belief: tuple[Array, Array] | None = None
 
