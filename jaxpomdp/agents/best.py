@@ -1,9 +1,9 @@
 """The best policy so far: what is kept of it, and when an agent goes back to it.
 
 Policies are judged by the discounted reward of the trials that they were used in, exploration included: by
-the average over a window of the latest trials or over its latest part, whichever is less. A long average alone
-would still praise a policy that was spoilt a few trials ago. Two averages differ clearly when they are further
-apart than some standard errors.
+the average over a window of the latest trials or over its latest part, whichever is less. A long average
+alone would still praise a policy that was spoilt a few trials ago. Two averages differ clearly when they are
+further apart than some standard errors.
 """
 
 from __future__ import annotations

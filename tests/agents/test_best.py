@@ -31,7 +31,7 @@ def test_a_standing_is_the_worse_of_a_long_and_a_short_average():
 
 
 def test_a_policy_that_was_just_spoilt_is_not_kept():
-    """The long average still rises when the old, bad trials leave the window; what was kept must not change."""
+    """The long average still rises while old, bad trials leave the window; what is kept stays."""
     best = keeping.none_yet(params_of(0), q_of(0))
     climbing = np.r_[np.zeros(8), np.ones(12)][None]
     best = keeping.judged(best, climbing, params_of(1), q_of(1), 2)
