@@ -16,12 +16,12 @@ from jaxpomdp.structure.splits import SplitConfig
 
 UDHMM = AgentConfig(
     ControlConfig(alpha=0.03, gamma=0.95, lam=0.95, schedule=Schedule(0.2, 0.0, 250_000)),
-    LearnerConfig(theta=0.0, policy=PolicyConfig(node_cap=70, edits_per_phase=1)),
+    LearnerConfig(theta=0.0, replay_passes=2, policy=PolicyConfig(node_cap=70, edits_per_phase=1)),
 )
-"""The 89-state maze at its best: 25 to 70 states, a window of 200 trials, one replay pass."""
+"""The 89-state maze at its best: 25 to 70 states, a window of 200 trials, two replay passes."""
 
 THESIS = AgentConfig(
-    ControlConfig(alpha=0.01, gamma=0.95, lam=0.9, schedule=Schedule(0.2, 0.0, 350_000)),
+    ControlConfig(alpha=0.01, gamma=0.95, lam=0.95, schedule=Schedule(0.2, 0.0, 350_000)),
     LearnerConfig(
         theta=0.2,
         bootstrap=False,
@@ -33,7 +33,7 @@ THESIS = AgentConfig(
         policy=PolicyConfig(node_cap=70, edits_per_phase=1, every=5),
     ),
 )
-"""As thesis section 3.5.3 says, with Loch and Singh's parameters of control."""
+"""As thesis section 3.5.3 says, with Loch and Singh's alpha and epsilon, and a lambda a little above theirs."""
 
 TMAZE = AgentConfig(
     ControlConfig(alpha=0.03, gamma=0.98, lam=0.98, schedule=Schedule(0.2, 0.0, 20_000), sticky=0.9),
