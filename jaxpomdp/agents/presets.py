@@ -33,7 +33,7 @@ THESIS = AgentConfig(
         policy=PolicyConfig(node_cap=70, edits_per_phase=1, every=5),
     ),
 )
-"""As thesis section 3.5.3 says, with Loch and Singh's alpha and epsilon, and a lambda a little above theirs."""
+"""As thesis section 3.5.3 says, with Loch and Singh's alpha and epsilon, and a lambda just above theirs."""
 
 TMAZE = AgentConfig(
     ControlConfig(alpha=0.03, gamma=0.98, lam=0.98, schedule=Schedule(0.2, 0.0, 20_000), sticky=0.9),
