@@ -49,14 +49,14 @@ def select(mask: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, y), yes, no)
 
 
-LATEST = 10
+LATEST = 4
 """The latest part of a window is one in so many of its trials."""
 
 
 def standing(recent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return how well each seed does now and the standard error of a window's mean, NaN where it is not full.
 
-    ``min(mean(last K), mean(last K / 10))`` of ``recent[S, K]``, newest last.
+    ``min(mean(last K), mean(last K / 4))`` of ``recent[S, K]``, newest last.
     """
     width = recent.shape[1]
     latest = recent[:, -max(width // LATEST, 1) :]

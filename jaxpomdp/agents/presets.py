@@ -47,6 +47,7 @@ TMAZE = AgentConfig(
         em_iterations=1,
         replay_passes=1,
         gate=0.3,
+        keep_best=60,
         revert_margin=0.0,
         patience=200,
         split=SplitConfig(stay=0.9),

@@ -26,7 +26,7 @@ def test_a_standing_is_the_worse_of_a_long_and_a_short_average():
     rising = np.r_[np.zeros(K - 2), 1, 1][None]
     falling = np.r_[np.ones(K - 2), 0, 1][None]
     np.testing.assert_allclose(keeping.standing(rising)[0], [0.1])
-    np.testing.assert_allclose(keeping.standing(falling)[0], [0.5])
+    np.testing.assert_allclose(keeping.standing(falling)[0], [0.8])
     np.testing.assert_allclose(keeping.standing(falling)[1], falling.std() / np.sqrt(K))
 
 
@@ -35,7 +35,7 @@ def test_a_policy_that_was_just_spoilt_is_not_kept():
     best = keeping.none_yet(params_of(0), q_of(0))
     climbing = np.r_[np.zeros(8), np.ones(12)][None]
     best = keeping.judged(best, climbing, params_of(1), q_of(1), 2)
-    spoilt = np.r_[np.zeros(4), np.ones(14), 0, 0][None]
+    spoilt = np.r_[np.zeros(4), np.ones(13), 0, 0, 0][None]
     assert spoilt.mean() > climbing.mean()
     best = keeping.judged(best, spoilt, params_of(2), q_of(2), 2)
     np.testing.assert_array_equal(best.q, q_of(1))
