@@ -1,8 +1,9 @@
 """The best policy so far: what is kept of it, and when an agent goes back to it.
 
-Policies are judged by the discounted reward of the trials that they were used in, exploration included, on
-average over a window of the latest trials; two averages differ clearly when they are further apart than some
-standard errors.
+Policies are judged by the discounted reward of the trials that they were used in, exploration included: by
+the average over a window of the latest trials or over its latest part, whichever is less. A long average
+alone would still praise a policy that was spoilt a few trials ago. Two averages differ clearly when they are
+further apart than some standard errors.
 """
 
 from __future__ import annotations
@@ -48,14 +49,23 @@ def select(mask: Array, yes: Any, no: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(mask.reshape(-1, *(1,) * (x.ndim - 1)), x, y), yes, no)
 
 
-def mean_and_error(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of each row and its standard error, NaN for a row that is not full."""
-    return rows.mean(axis=1), rows.std(axis=1) / np.sqrt(rows.shape[1])
+LATEST = 10
+"""The latest part of a window is one in so many of its trials."""
+
+
+def standing(recent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how well each seed does now and the standard error of a window's mean, NaN where it is not full.
+
+    ``min(mean(last K), mean(last K / 10))`` of ``recent[S, K]``, newest last.
+    """
+    width = recent.shape[1]
+    latest = recent[:, -max(width // LATEST, 1) :]
+    return np.minimum(recent.mean(axis=1), latest.mean(axis=1)), recent.std(axis=1) / np.sqrt(width)
 
 
 def judged(best: Best, recent: np.ndarray, params: Any, q: Array, trials: int) -> Best:
-    """Keep the policy of now where the average of the ``recent[S, K]`` trials is the best so far."""
-    average, error = mean_and_error(recent)
+    """Keep the policy of now where it stands better after the ``recent[S, K]`` trials than any did so far."""
+    average, error = standing(recent)
     better = np.where(np.isnan(average), -np.inf, average) > best.score
     kept = select(better, (params, q), (best.params, best.q))
     score, error = (np.where(better, x, y) for x, y in ((average, best.score), (error, best.error)))
@@ -67,6 +77,6 @@ def clearly_worse(best: Best, recent: np.ndarray, margin: float) -> np.ndarray:
 
     Where too few trials were made since a new start, now counts as worse than any best there is.
     """
-    now, error = mean_and_error(recent)
+    now, error = standing(recent)
     further = best.score - now > np.maximum(margin * np.hypot(error, best.error), ALIKE * np.abs(best.score))
     return np.where(np.isnan(now), np.isfinite(best.score), further)

@@ -17,12 +17,12 @@ from jaxpomdp.structure.splits import SplitConfig
 
 UDHMM = AgentConfig(
     ControlConfig(alpha=0.03, gamma=0.95, lam=0.95, schedule=Schedule(0.2, 0.0, 250_000)),
-    LearnerConfig(theta=0.0, policy=PolicyConfig(node_cap=70, edits_per_phase=1)),
+    LearnerConfig(theta=0.0, replay_passes=2, policy=PolicyConfig(node_cap=70, edits_per_phase=1)),
 )
-"""The 89-state maze at its best: 25 to 70 states, a window of 200 trials, one replay pass."""
+"""The 89-state maze at its best: 25 to 70 states, a window of 200 trials, two replay passes."""
 
 THESIS = AgentConfig(
-    ControlConfig(alpha=0.01, gamma=0.95, lam=0.9, schedule=Schedule(0.2, 0.0, 350_000)),
+    ControlConfig(alpha=0.01, gamma=0.95, lam=0.95, schedule=Schedule(0.2, 0.0, 350_000)),
     LearnerConfig(
         theta=0.2,
         bootstrap=False,
@@ -34,7 +34,7 @@ THESIS = AgentConfig(
         policy=PolicyConfig(node_cap=70, edits_per_phase=1, every=5),
     ),
 )
-"""As thesis section 3.5.3 says, with Loch and Singh's parameters of control."""
+"""As thesis section 3.5.3 says, with Loch and Singh's alpha and epsilon, and a lambda just above theirs."""
 
 TMAZE = AgentConfig(
     ControlConfig(alpha=0.03, gamma=0.98, lam=0.98, schedule=Schedule(0.2, 0.0, 20_000), sticky=0.9),
@@ -48,29 +48,48 @@ TMAZE = AgentConfig(
         em_iterations=1,
         replay_passes=1,
         gate=0.3,
+        revert_margin=0.0,
+        patience=200,
         split=SplitConfig(stay=0.9),
         policy=PolicyConfig(node_cap=20, edits_per_phase=1),
     ),
 )
-"""The T-maze: returns by action with a discount of their own, and a gate."""
+"""The T-maze: returns by action with a discount of their own, a gate, and the best policy always restored."""
 
 HALLWAY = AgentConfig(
-    ControlConfig(alpha=0.1, gamma=0.9, lam=0.9, schedule=Schedule(0.1, 0.1, 1, "constant"), optimism=2.0),
+    ControlConfig(alpha=0.03, gamma=0.9, lam=0.7, schedule=Schedule(0.1, 0.1, 1, "constant"), optimism=2.0),
     LearnerConfig(
         states=17,
         theta=0.2,
         return_gamma=0.9,
         return_by_action=True,
-        window=30,
+        window=100,
         trials_per_phase=5,
-        em_iterations=1,
+        em_iterations=2,
         replay_passes=3,
         gate=0.3,
-        keep_best=30,
+        keep_best=50,
+        patience=100,
+        split=SplitConfig(rank="spread"),
         policy=PolicyConfig(node_cap=40, edits_per_phase=1),
     ),
 )
-"""The hallway: optimistic values, three replay passes, a gate."""
+"""The hallway: optimistic values, three replay passes, splits where returns spread most, a gate."""
+
+NOISY_HALLWAY = AgentConfig(
+    replace(HALLWAY.control, alpha=0.01, lam=0.9),
+    replace(
+        HALLWAY.learner,
+        theta=0.1,
+        window=400,
+        trials_per_phase=10,
+        em_iterations=1,
+        gate=0.0,
+        keep_best=100,
+        patience=0,
+    ),
+)
+"""The hallway with the noise of section 3.5.1: slower values, a longer memory, and no gate."""
 
 
 def coupled(base: AgentConfig, *, node_cap: int, **settings: Any) -> AgentConfig:
@@ -92,6 +111,7 @@ LEARNERS: Mapping[str, AgentConfig] = {
     "udhmm-thesis": THESIS,
     "udhmm-tmaze": TMAZE,
     "udhmm-hallway": HALLWAY,
+    "udhmm-hallway-noise": NOISY_HALLWAY,
     "pda": replace(
         UDHMM, learner=replace(UDHMM.learner, theta=0.0, policy=PolicyConfig(node_cap=70, edits_per_phase=0))
     ),

@@ -27,6 +27,8 @@ class Row:
     """What is run (its seeds are replaced by those asked for); None: a published row, nothing to run."""
     published: Published = field(default_factory=dict)
     """Published figures by metric; a text where it is no number, such as ``">251"``."""
+    criterion: Criterion | None = None
+    """When a run of this row counts as a success, where rows differ; None: as the experiment says."""
 
 
 class Measured(NamedTuple):
@@ -62,7 +64,7 @@ class Experiment:
 
 def analyse(row: Row, run: RunData, criterion: Criterion | None) -> Measured:
     """Return what each seed scored in its final greedy trials, and the summary over seeds."""
-    per_seed = score(run.final)
+    per_seed, criterion = score(run.final), row.criterion or criterion
     if criterion is not None:
         found = outcome(criterion, run)
         per_seed |= {

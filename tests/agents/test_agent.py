@@ -31,6 +31,8 @@ SETTINGS = {
     "minimum_weight": 8.0,
     "split.significance": 0.5,
     "keep_best": 6,
+    "revert_margin": 1.0,
+    "patience": 0,
     "gate": 0.0,
 }
 KEY = jax.random.key(1)
@@ -131,8 +133,10 @@ def test_experience_holds_the_latest_trials(run):
     np.testing.assert_array_equal(store.lengths[:, :6] - 1, run.rows[-2]["steps"])
 
 
-def test_the_best_score_is_the_best_average_so_far(run):
-    averages = np.stack([row["discounted"].mean(axis=1) for row in run.rows])
+def test_the_best_score_is_the_best_standing_so_far(run):
+    averages = np.stack(
+        [np.minimum(row["discounted"].mean(axis=1), row["discounted"][:, -1]) for row in run.rows]
+    )
     for state, best in zip(run.states[1:], np.maximum.accumulate(averages), strict=True):
         np.testing.assert_allclose(state.best.score, best)
     np.testing.assert_array_equal(run.states[-1].recent, run.rows[-1]["discounted"])

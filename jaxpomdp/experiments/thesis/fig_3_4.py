@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxpomdp.experiments.experiment import Experiment, Published, Row
 from jaxpomdp.experiments.thesis import hallway
 
-SETTINGS = {f"θ = {theta:g}": hallway.run("hallway", theta) for theta in (0.0, 0.2, 0.4)}
+SETTINGS = {f"θ = {theta:g}": hallway.run(theta) for theta in (0.0, 0.2, 0.4)}
 TARGETS: dict[str, Published] = {
     "θ = 0": {"successes_ever": "fewer than half, in 100 trials"},
     "θ = 0.4": {"successes_ever": 21},

@@ -13,8 +13,11 @@ EXPERIMENT = Experiment(
     title="Figure 3.5: the hallway, without and with noise",
     source="thesis, Figure 3.5 and section 3.5.1 (the curves' points are in no public text)",
     rows=(
-        Row("standard", hallway.run("hallway", 0.2)),
-        Row("noise", hallway.run("hallway-noise", 0.2)),
+        Row("standard", hallway.run(0.2)),
+        Row("noise, θ = 0.1", hallway.noisy_run(0.1)),
+        Row("noise, θ = 0", hallway.noisy_run(0.0)),
+        Row("noise, θ = 0.2", hallway.noisy_run(0.2)),
+        Row("noise, θ = 0.4", hallway.noisy_run(0.4)),
         Row("coupled, no noise", None, TARGETS),
     ),
     columns=hallway.COLUMNS,

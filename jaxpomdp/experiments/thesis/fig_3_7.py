@@ -10,14 +10,15 @@ from jaxpomdp.experiments.experiment import Experiment, Measured, Published, Row
 from jaxpomdp.experiments.plots import Bars, bars
 from jaxpomdp.experiments.results import Criterion
 
+CRITERION = Criterion("goal_percent", 95.0, last=2)
 LENGTHS = (4, 10, 20, 50, 100, 200)
 TARGETS: dict[int, Published] = {n: {"successes_held": "poor"} for n in LENGTHS if n > 10}
 """Section 3.5.2, in words: above N = 10 the algorithm performs poorly; RL-LSTM handles N up to 50."""
 
 
-def run(length: int) -> RunConfig:
+def run(length: int, theta: float = 0.2) -> RunConfig:
     """Return a run of 1,500 trials, judged every 50."""
-    settings = (("theta", 0.2),)
+    settings = (("theta", theta),)
     return RunConfig(f"tmaze-{length}", "udhmm-tmaze", trials=1500, evaluate_every=50, settings=settings)
 
 
@@ -44,6 +45,6 @@ EXPERIMENT = Experiment(
         "goal_percent": "right arm in the end, %, median run",
     },
     plot=plot,
-    criterion=Criterion("goal_percent", 95.0, last=2),
+    criterion=CRITERION,
     notes="A run holds when its last two greedy evaluations take the right arm in at least 95 % of trials.",
 )

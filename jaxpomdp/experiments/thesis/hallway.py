@@ -28,10 +28,16 @@ NOTES = (
 )
 
 
-def run(env: str, theta: float) -> RunConfig:
+def run(theta: float) -> RunConfig:
     """Return a run of 400 trials, judged every 10."""
-    config = RunConfig(env, "udhmm-hallway", trials=400, evaluate_every=10, evaluation_trials=50)
+    config = RunConfig("hallway", "udhmm-hallway", trials=400, evaluate_every=10, evaluation_trials=50)
     return replace(config, settings=(("theta", theta),))
+
+
+def noisy_run(theta: float) -> RunConfig:
+    """Return a run of 1,500 trials with noise, judged every 50 on many trials, since these vary."""
+    config = RunConfig("hallway-noise", "udhmm-hallway-noise", trials=1500, evaluate_every=50)
+    return replace(config, evaluation_trials=251, settings=(("theta", theta),))
 
 
 def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:

@@ -19,8 +19,8 @@ def run(agent: str, trials: int = TRIALS, **settings: float) -> RunConfig:
     return RunConfig("maze89", agent, trials=trials, evaluate_every=250, settings=tuple(settings.items()))
 
 
-THETA_02 = run("udhmm-thesis", 5000, theta=0.2)
-THETA_0 = run("udhmm-thesis", 5000, theta=0.0)
+THETA_02 = run("udhmm-thesis", theta=0.2)
+THETA_0 = run("udhmm-thesis", theta=0.0)
 BEST = run("udhmm")
 
 

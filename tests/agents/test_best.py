@@ -1,0 +1,84 @@
+"""The best policy so far: how it is judged, and when an agent goes back to it or begins again."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxpomdp.agents import best as keeping
+from jaxpomdp.agents.agent import Agent
+from jaxpomdp.agents.presets import TMAZE
+from jaxpomdp.agents.settings import with_settings
+from jaxpomdp.envs.tmaze import tmaze
+
+K = 20
+
+
+def params_of(number):
+    return {"table": jnp.full((1, 2), float(number))}
+
+
+def q_of(number):
+    return jnp.full((1, 3, 2), float(number))
+
+
+def test_a_standing_is_the_worse_of_a_long_and_a_short_average():
+    rising = np.r_[np.zeros(K - 2), 1, 1][None]
+    falling = np.r_[np.ones(K - 2), 0, 1][None]
+    np.testing.assert_allclose(keeping.standing(rising)[0], [0.1])
+    np.testing.assert_allclose(keeping.standing(falling)[0], [0.5])
+    np.testing.assert_allclose(keeping.standing(falling)[1], falling.std() / np.sqrt(K))
+
+
+def test_a_policy_that_was_just_spoilt_is_not_kept():
+    """The long average still rises while old, bad trials leave the window; what is kept stays."""
+    best = keeping.none_yet(params_of(0), q_of(0))
+    climbing = np.r_[np.zeros(8), np.ones(12)][None]
+    best = keeping.judged(best, climbing, params_of(1), q_of(1), 2)
+    spoilt = np.r_[np.zeros(4), np.ones(14), 0, 0][None]
+    assert spoilt.mean() > climbing.mean()
+    best = keeping.judged(best, spoilt, params_of(2), q_of(2), 2)
+    np.testing.assert_array_equal(best.q, q_of(1))
+    np.testing.assert_array_equal(best.params["table"], params_of(1)["table"])
+    assert best.age == [2]
+    better = np.r_[np.zeros(2), np.ones(18)][None]
+    best = keeping.judged(best, better, params_of(3), q_of(3), 2)
+    np.testing.assert_array_equal(best.q, q_of(3))
+    np.testing.assert_allclose(best.score, 0.9)
+    assert best.age == [0]
+
+
+def test_where_nothing_is_left_to_chance_a_hair_is_no_difference():
+    best = keeping.none_yet(params_of(0), q_of(0))._replace(score=np.array([1.0]))
+    assert not keeping.clearly_worse(best, np.full((1, K), 0.995), 3.0)[0]
+    assert keeping.clearly_worse(best, np.full((1, K), 0.98), 3.0)[0]
+
+
+def test_a_window_that_is_not_full_counts_as_worse_than_any_best():
+    unfull = np.r_[np.nan, np.ones(K - 1)][None]
+    best = keeping.none_yet(params_of(0), q_of(0))
+    assert not keeping.clearly_worse(best, unfull, 1.0)[0]
+    assert keeping.clearly_worse(best._replace(score=np.array([-5.0])), unfull, 1.0)[0]
+
+
+def waiting(patience):
+    settings = {"patience": patience, "keep_best": 10, "window": 20, "gate": 0.0, "em_iterations": 0}
+    settings |= {"edits_per_phase": 0, "replay_passes": 0, "alpha": 0.0}
+    return Agent(tmaze(1, step_limit=6), with_settings(TMAZE, settings))
+
+
+def after(agent, rounds):
+    state = agent.init(range(3))
+    for _ in range(rounds):
+        state, _ = agent.run(state)
+    return state
+
+
+def test_an_agent_that_gets_no_better_begins_again():
+    start, patient, impatient = waiting(0).init(range(3)), after(waiting(0), 8), after(waiting(10), 8)
+    np.testing.assert_array_equal(start.params.log_trans, patient.params.log_trans)
+    changed = np.asarray(impatient.params.log_trans != start.params.log_trans).reshape(3, -1).any(axis=1)
+    assert changed.all()
+    assert (impatient.best.age < 40).all()
+    again = after(waiting(10), 8)
+    np.testing.assert_array_equal(again.params.log_trans, impatient.params.log_trans)
