@@ -105,6 +105,7 @@ CUDHMM = coupled(HALLWAY, node_cap=30, return_cap=8)
 
 LEARNERS: Mapping[str, AgentConfig] = {
     "cudhmm": CUDHMM,
+    "cudhmm-mixture": coupled(HALLWAY, node_cap=30, return_cap=8, coupling="mixture", added="components"),
     "cudhmm-maze89": coupled(UDHMM, node_cap=50, return_cap=8),
     "cudhmm-tmaze": coupled(TMAZE, node_cap=20, return_cap=8),
     "udhmm": UDHMM,
