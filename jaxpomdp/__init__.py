@@ -19,12 +19,17 @@ if TYPE_CHECKING:
     from jaxpomdp.agents.agent import make_agent as make_agent
     from jaxpomdp.agents.control import ControlConfig as ControlConfig
     from jaxpomdp.agents.control import Schedule as Schedule
+    from jaxpomdp.agents.coupled_kind import CoupledModel as CoupledModel
     from jaxpomdp.agents.gym_agent import GymAgent as GymAgent
+    from jaxpomdp.agents.kinds import FlatModel as FlatModel
+    from jaxpomdp.agents.kinds import Kind as Kind
     from jaxpomdp.agents.learner import LearnerConfig as LearnerConfig
     from jaxpomdp.agents.planners import PlannerConfig as PlannerConfig
     from jaxpomdp.agents.planners import plan as plan
     from jaxpomdp.agents.policies import Policy as Policy
     from jaxpomdp.agents.policies import evaluate_policy as evaluate_policy
+    from jaxpomdp.coupled_packing import pack_coupled as pack_coupled
+    from jaxpomdp.coupled_packing import unpack_coupled as unpack_coupled
     from jaxpomdp.envs.drawing import draw as draw
     from jaxpomdp.envs.hallway import hallway as hallway
     from jaxpomdp.envs.hallway import hallway_navigation as hallway_navigation
@@ -69,6 +74,11 @@ if TYPE_CHECKING:
     from jaxpomdp.kernels.sampling import sample_path as sample_path
     from jaxpomdp.kernels.sampling import sample_posterior as sample_posterior
     from jaxpomdp.kernels.smoothing import smooth as smooth
+    from jaxpomdp.models.coupled import COUPLED_MIXTURE as COUPLED_MIXTURE
+    from jaxpomdp.models.coupled import COUPLED_PRODUCT as COUPLED_PRODUCT
+    from jaxpomdp.models.coupled import CoupledParams as CoupledParams
+    from jaxpomdp.models.coupled_init import couple as couple
+    from jaxpomdp.models.coupled_init import silent as silent
     from jaxpomdp.models.data import trial_batch as trial_batch
     from jaxpomdp.models.em import EMConfig as EMConfig
     from jaxpomdp.models.em import EMReport as EMReport
@@ -96,6 +106,7 @@ if TYPE_CHECKING:
     from jaxpomdp.models.store import save as save
     from jaxpomdp.packing import pack as pack
     from jaxpomdp.packing import unpack as unpack
+    from jaxpomdp.structure.coupled_spec import CoupledSpec as CoupledSpec
     from jaxpomdp.structure.evidence import ReturnEvidence as ReturnEvidence
     from jaxpomdp.structure.evidence import return_evidence as return_evidence
     from jaxpomdp.structure.policy import PolicyConfig as PolicyConfig
@@ -109,9 +120,14 @@ _HOMES = {
     "Agent": "jaxpomdp.agents.agent",
     "AgentConfig": "jaxpomdp.agents.agent",
     "AgentState": "jaxpomdp.agents.agent",
+    "COUPLED_MIXTURE": "jaxpomdp.models.coupled",
+    "COUPLED_PRODUCT": "jaxpomdp.models.coupled",
     "Categorical": "jaxpomdp.models.emission",
     "Chain": "jaxpomdp._types",
     "ControlConfig": "jaxpomdp.agents.control",
+    "CoupledModel": "jaxpomdp.agents.coupled_kind",
+    "CoupledParams": "jaxpomdp.models.coupled",
+    "CoupledSpec": "jaxpomdp.structure.coupled_spec",
     "Decoded": "jaxpomdp.kernels.decoding",
     "DiagonalGaussian": "jaxpomdp.models.emission",
     "EMConfig": "jaxpomdp.models.em",
@@ -119,11 +135,13 @@ _HOMES = {
     "FLAT": "jaxpomdp.models.flat",
     "Family": "jaxpomdp.models.family",
     "Filtered": "jaxpomdp.kernels.filtering",
+    "FlatModel": "jaxpomdp.agents.kinds",
     "FlatParams": "jaxpomdp.models.flat",
     "FlatSpec": "jaxpomdp.structure.spec",
     "FullGaussian": "jaxpomdp.models.full_gaussian",
     "GradientConfig": "jaxpomdp.models.gradient",
     "GymAgent": "jaxpomdp.agents.gym_agent",
+    "Kind": "jaxpomdp.agents.kinds",
     "LearnerConfig": "jaxpomdp.agents.learner",
     "ParsedPOMDP": "jaxpomdp.envs.pomdp_tables",
     "PlannerConfig": "jaxpomdp.agents.planners",
@@ -143,6 +161,7 @@ _HOMES = {
     "TrueModel": "jaxpomdp.envs.world",
     "World": "jaxpomdp.envs.world",
     "bic": "jaxpomdp.models.selection",
+    "couple": "jaxpomdp.models.coupled_init",
     "draw": "jaxpomdp.envs.drawing",
     "e_step": "jaxpomdp.models.em",
     "em_step": "jaxpomdp.models.em",
@@ -169,6 +188,7 @@ _HOMES = {
     "observation_seeded": "jaxpomdp.models.init",
     "observe": "jaxpomdp.kernels.filtering",
     "pack": "jaxpomdp.packing",
+    "pack_coupled": "jaxpomdp.coupled_packing",
     "perseus": "jaxpomdp.kernels.planning",
     "plan": "jaxpomdp.agents.planners",
     "posterior": "jaxpomdp.kernels.posterior",
@@ -186,6 +206,7 @@ _HOMES = {
     "sample_path": "jaxpomdp.kernels.sampling",
     "sample_posterior": "jaxpomdp.kernels.sampling",
     "save": "jaxpomdp.models.store",
+    "silent": "jaxpomdp.models.coupled_init",
     "smooth": "jaxpomdp.kernels.smoothing",
     "step": "jaxpomdp.envs.world",
     "step_key": "jaxpomdp.envs.world",
@@ -194,6 +215,7 @@ _HOMES = {
     "to_pomdp": "jaxpomdp.envs.pomdp_world",
     "trial_batch": "jaxpomdp.models.data",
     "unpack": "jaxpomdp.packing",
+    "unpack_coupled": "jaxpomdp.coupled_packing",
     "update_belief": "jaxpomdp.kernels.filtering",
     "value_iteration": "jaxpomdp.kernels.planning",
     "viterbi": "jaxpomdp.kernels.decoding",

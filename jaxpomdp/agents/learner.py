@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpomdp._types import Array, Posterior, TrialBatch
+from jaxpomdp._types import Array, TrialBatch
 from jaxpomdp.agents.best import select
 from jaxpomdp.agents.control import ControlConfig
 from jaxpomdp.agents.trial import memory_of
@@ -142,13 +142,14 @@ def gather_evidence(
     """
     seen = e_step(family, params, batch, config)
     choices = params.returns.mean.shape[-1]
-    over = partial(_evidence_of_model, bins=bins, choices=choices, by_trial=by_trial)
-    return jax.vmap(over)(seen, batch, trial)
+    over = partial(evidence_of_model, bins=bins, choices=choices, by_trial=by_trial)
+    return jax.vmap(over)(seen.gamma, batch, trial)
 
 
-def _evidence_of_model(
-    seen: Posterior, batch: TrialBatch, trial: Array, *, bins: int, choices: int, by_trial: bool
+def evidence_of_model(
+    gamma: Array, batch: TrialBatch, trial: Array, *, bins: int, choices: int, by_trial: bool
 ) -> tuple[Array, ...]:
+    """Return the arrays of ``ReturnEvidence`` of one model, from smoothed beliefs ``gamma[B, T, N]``."""
     counted = batch.valid & batch.has_return
     returns = jnp.where(counted, batch.returns, 0)
     low = jnp.min(jnp.where(counted, batch.returns, jnp.inf))
@@ -156,10 +157,10 @@ def _evidence_of_model(
     empty = ~jnp.any(counted)
     low, high = jnp.where(empty, 0, low), jnp.where(empty, 1, high)
     edges = jnp.linspace(low, jnp.maximum(high, low + 1e-6 * (1 + jnp.abs(low))), bins + 1)
-    hist = return_histogram(seen.gamma, returns, batch.actions, counted, edges, choices)
+    hist = return_histogram(gamma, returns, batch.actions, counted, edges, choices)
     chosen = jax.nn.one_hot(batch.actions if choices > 1 else 0 * batch.actions, choices, dtype=returns.dtype)
     chosen = (chosen * counted[..., None]).reshape(-1, choices)
-    rows = seen.gamma.reshape(-1, seen.gamma.shape[-1])
+    rows = gamma.reshape(-1, gamma.shape[-1])
     away = (returns - _mean(returns, counted)).reshape(-1, 1)
     weight, first, second = (jnp.matmul(rows.T, chosen * x, precision="highest") for x in (1, away, away**2))
     mean = first / jnp.maximum(weight, 1e-30)

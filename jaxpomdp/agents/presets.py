@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxpomdp.agents.agent import Agent, AgentConfig
 from jaxpomdp.agents.control import ControlConfig, Schedule
+from jaxpomdp.agents.coupled_kind import CoupledModel
 from jaxpomdp.agents.learner import LearnerConfig
 from jaxpomdp.agents.settings import with_settings
 from jaxpomdp.envs.world import World
@@ -91,7 +92,23 @@ NOISY_HALLWAY = AgentConfig(
 )
 """The hallway with the noise of section 3.5.1: slower values, a longer memory, and no gate."""
 
+
+def coupled(base: AgentConfig, *, node_cap: int, **settings: Any) -> AgentConfig:
+    """Return the coupled agent (thesis 3.4) with the settings of a flat one, and fewer states of strand 0."""
+    policy = replace(base.learner.policy, node_cap=node_cap)
+    return replace(
+        base, learner=replace(base.learner, theta=0.2, policy=policy), model=CoupledModel(**settings)
+    )
+
+
+CUDHMM = coupled(HALLWAY, node_cap=30, return_cap=8)
+"""The coupled agent in the hallway."""
+
 LEARNERS: Mapping[str, AgentConfig] = {
+    "cudhmm": CUDHMM,
+    "cudhmm-mixture": coupled(HALLWAY, node_cap=30, return_cap=8, coupling="mixture", added="components"),
+    "cudhmm-maze89": coupled(UDHMM, node_cap=50, return_cap=8),
+    "cudhmm-tmaze": coupled(TMAZE, node_cap=20, return_cap=8),
     "udhmm": UDHMM,
     "udhmm-thesis": THESIS,
     "udhmm-tmaze": TMAZE,

@@ -1,7 +1,10 @@
 """Evaluation plans of coupled chains: the posterior of many models on many tapes, whichever plan runs.
 
-- ``scan`` is the definition: ``smooth_joint`` under two maps.
-- ``batched`` (and ``auto``) carries all tapes of all models through time at once.
+- ``scan`` is the definition: ``smooth_joint`` under two maps; no array has the size of a pair times a pair.
+- ``pairs`` writes the pair of states down as one chain, for the C++ loop of ``posterior``, which skips pairs
+  of no weight; on CPU in float32 where it could be built. It takes the memory of a flat chain of ``N_1 N_2``
+  states.
+- ``auto`` takes ``pairs`` where it can and there are no more than ``MOST_PAIRS``, and ``scan`` elsewhere.
 """
 
 from __future__ import annotations
@@ -12,10 +15,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxpomdp._types import Array
-from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior
+from jaxpomdp._types import Array, Chain, Posterior
+from jaxpomdp.kernels import native
+from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior, check_two, joint_density
 from jaxpomdp.kernels.coupled_exact import smooth_joint
 from jaxpomdp.kernels.coupled_marginals import smooth_marginals
+from jaxpomdp.kernels.posterior import posterior
+from jaxpomdp.numerics import NEG
 
 Rows = tuple[Array, ...]
 
@@ -32,8 +38,54 @@ def _mapped(kernel: Any, chains: CoupledChain, *tapes: Any) -> CoupledPosterior:
     return _added(jax.vmap(over_tapes)(chains, *tapes))
 
 
-PLANS = {"auto": partial(_mapped, smooth_joint), "scan": partial(_mapped, smooth_joint)}
+MOST_PAIRS = 1024
+"""Pairs of states up to which ``auto`` writes them down as one chain."""
+
+
+def pair_chain(chains: CoupledChain) -> Chain:
+    """Return two chains (leading ``S``) as one of ``N_1 N_2`` states, numbered ``o N_2 + r``."""
+    first, second = chains.log_trans
+    models, actions, one, two = first.shape[:4]
+    moves = jnp.maximum(first[..., :, None] + second[..., None, :], NEG)
+    init = jnp.maximum(joint_density(chains.log_init), NEG)
+    pairs = one * two
+    return Chain(init.reshape(models, pairs), moves.reshape(models, actions, pairs, pairs))
+
+
+def _paired(chains: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array) -> Posterior:
+    rows = jnp.maximum(joint_density(log_obs), NEG)
+    rows = rows.reshape(*rows.shape[:-2], -1)
+    return posterior(pair_chain(chains), rows, actions, start, valid)
+
+
+def _pairs_plan(chains: CoupledChain, *tapes: Any) -> CoupledPosterior:
+    """Smooth the pair as one chain, and sum each chain's share out of what comes back."""
+    one, two = (x.shape[-1] for x in chains.log_init)
+    seen = _paired(chains, *tapes)
+    gamma, initial = (x.reshape(*x.shape[:-1], one, two) for x in (seen.gamma, seen.initial))
+    xi = seen.xi.reshape(*seen.xi.shape[:2], one, two, one, two)
+    both = lambda x: (jnp.sum(x, axis=-1), jnp.sum(x, axis=-2))  # noqa: E731
+    return CoupledPosterior(seen.log_evidence, both(gamma), both(xi), both(initial))
+
+
+PLANS = {"scan": partial(_mapped, smooth_joint), "pairs": _pairs_plan}
 """The evaluation plans of exact inference."""
+
+
+def choose_plan(plan: str, chains: CoupledChain) -> str:
+    """Resolve ``auto``.
+
+    Raises:
+        ValueError: ``plan`` is not known, or there are not two chains.
+    """
+    if plan not in ("auto", *PLANS):
+        raise ValueError(f"plan must be one of {('auto', *PLANS)}, got {plan!r}")
+    check_two(chains)
+    if plan != "auto":
+        return plan
+    few = chains.log_init[0].shape[-1] * chains.log_init[1].shape[-1] <= MOST_PAIRS
+    fast = chains.log_init[0].dtype == jnp.float32 and native.available()
+    return "pairs" if few and fast else "scan"
 
 
 @partial(jax.jit, static_argnames="plan")
@@ -52,7 +104,7 @@ def coupled_posterior(
         actions: int ``[S, B, T]``.
         start: bool ``[S, B, T]``.
         valid: bool ``[S, B, T]``.
-        plan: one of ``PLANS``; all give the same up to rounding.
+        plan: ``auto`` or one of ``PLANS``; all give the same up to rounding.
 
     Returns:
         ``log_evidence[S, B]``, ``gamma[c][S, B, T, N_c]``; ``xi`` and ``initial``, sums over the tapes.
@@ -60,10 +112,9 @@ def coupled_posterior(
     Raises:
         ValueError: ``plan`` is not known, there are not two chains, or the shapes do not fit.
     """
-    if plan not in PLANS:
-        raise ValueError(f"plan must be one of {tuple(PLANS)}, got {plan!r}")
+    chosen = choose_plan(plan, chains)
     _check_shapes(chains, log_obs, actions, start, valid)
-    return _posterior(chains, log_obs, actions, start, valid, plan=plan)
+    return _posterior(chains, log_obs, actions, start, valid, plan=chosen)
 
 
 @partial(jax.jit, static_argnames="plan")

@@ -114,8 +114,9 @@ def _log_obs(params: CoupledParams, observations: tuple[Array, ...], observed: A
 
 def _acting(params: CoupledParams) -> Chain:
     strand = params.strands[0]
-    both = strand.alive[:, None] & strand.alive[None, :]
-    return Chain(_mask(strand, strand.log_init), jnp.where(both[None], params.log_alone, NEG))
+    both = strand.alive[..., :, None] & strand.alive[..., None, :]
+    alone = jnp.where(both[..., None, :, :], params.log_alone, NEG)
+    return Chain(_mask(strand, strand.log_init), alone)
 
 
 def _learning_rows(strand: Strand, channels: tuple[Array, ...], batch: TrialBatch, theta: float) -> Array:

@@ -178,10 +178,10 @@ def validate(spec: FlatSpec) -> None:
         if not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite, got NaN or infinity at {_first(~np.isfinite(array))}")
     for name, array in {"log_init": spec.log_init, "log_trans": spec.log_trans}.items():
-        _expect_rows(name, array)
+        stop_if_bad_rows(name, array)
     for name, array in _channel_arrays(spec).items():
         if name.endswith("log_prob"):
-            _expect_rows(name, array)
+            stop_if_bad_rows(name, array)
     if not (spec.return_var > 0).all():
         raise ValueError(f"return_var must be positive, got {spec.return_var.min()}")
 
@@ -191,7 +191,12 @@ def _table(probability: object) -> Channel:
     return Channel("Categorical", {"log_prob": safe_log(frozen("emission table", probability))})
 
 
-def _expect_rows(name: str, log_prob: np.ndarray) -> None:
+def stop_if_bad_rows(name: str, log_prob: np.ndarray) -> None:
+    """Stop unless the probabilities of every last axis sum to one.
+
+    Raises:
+        ValueError: naming the array, the sum and its row.
+    """
     totals = np.exp(log_prob).sum(-1)
     wrong = np.abs(totals - 1) > ROW_TOLERANCE
     if wrong.any():
@@ -242,15 +247,16 @@ def _sizes(channel: Channel) -> str:
     return f"[{first.shape[1]}]" if first.ndim > 1 else ""
 
 
-def _state_line(spec: FlatSpec, state: int, shown: int = 3) -> str:
+def _state_line(spec: FlatSpec, state: int) -> str:
     """Describe one state: its start, its return, and the likeliest successors under each action."""
     pairs = zip(spec.return_mean[state], np.sqrt(spec.return_var[state]), strict=True)
     returns = ", ".join(f"{mean:.3g} +- {deviation:.2g}" for mean, deviation in pairs)
-    exits = "; ".join(_exits(row, a, shown) for a, row in enumerate(np.exp(spec.log_trans[:, state])))
+    exits = "; ".join(exits_line(row, a) for a, row in enumerate(np.exp(spec.log_trans[:, state])))
     return f"  state {state}: starts {np.exp(spec.log_init[state]):.2f}, return {returns}, {exits}"
 
 
-def _exits(row: np.ndarray, action: int, shown: int) -> str:
+def exits_line(row: np.ndarray, action: int, shown: int = 3) -> str:
+    """Describe where a row of probabilities leads, by the likeliest states."""
     likely = sorted(np.argsort(-row, kind="stable")[:shown])
     parts = [f"{k} ({'1.0' if row[k] >= 0.995 else f'{row[k]:.2f}'[1:]})" for k in likely if row[k] >= 0.005]
     return f"a{action} -> " + " ".join(parts)

@@ -209,7 +209,7 @@ def apply_split(spec: FlatSpec, edit: Edit) -> FlatSpec:
             f"got {edit.kind!r} for {edit.num_states} (see Edit.moved)"
         )
     split: StateSplit = edit.details
-    cloned = clone_state(spec, edit.node, _shares(spec, split))
+    cloned = clone_state(spec, edit.node, split_shares(spec.num_actions, spec.num_states, split))
     copies = np.flatnonzero(edit.origin == edit.node)
     mean, var = cloned.return_mean.copy(), cloned.return_var.copy()
     if split.shift:
@@ -317,12 +317,12 @@ def _mixture(counts: np.ndarray, evidence: ReturnEvidence, config: SplitConfig) 
     return mixture, accepted
 
 
-def _shares(spec: FlatSpec, split: StateSplit) -> Shares:
+def split_shares(actions: int, states: int, split: StateSplit) -> Shares:
     """Return the shares of a split, jittered per action and predecessor."""
     shares, copies = split.shares, split.mixture.components
-    incoming = np.broadcast_to(shares, (spec.num_actions, spec.num_states, copies))
+    incoming = np.broadcast_to(shares, (actions, states, copies))
     rows = shares if split.stay is None else sticky_among(shares, split.stay)
-    among = np.broadcast_to(rows, (spec.num_actions, copies, copies))
+    among = np.broadcast_to(rows, (actions, copies, copies))
     if split.jitter == 0:
         return Shares(shares, incoming, among)
     rng = np.random.default_rng(split.seed)

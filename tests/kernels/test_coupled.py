@@ -19,6 +19,7 @@ from jaxpomdp.kernels.coupled import (
 )
 from jaxpomdp.kernels.coupled_exact import smooth_both, smooth_joint, smooth_joint_exact
 from jaxpomdp.kernels.coupled_paths import sample_coupled, sample_joint_posterior, viterbi_joint
+from jaxpomdp.kernels.coupled_plans import coupled_posterior
 from jaxpomdp.kernels.smoothing import smooth
 from tests.kernels.coupled_problems import CoupledProblem, random_coupled
 from tests.kernels.problems import log_of, quick_jit, random_problem, random_rows
@@ -231,3 +232,20 @@ def test_a_flat_chain_is_a_chain_coupled_to_nothing() -> None:
     np.testing.assert_allclose(got.log_evidence, want.log_evidence, rtol=1e-5)
     np.testing.assert_allclose(got.gamma[0], want.gamma, atol=1e-5)
     np.testing.assert_allclose(got.xi[0][:, :, 0], want.xi, atol=1e-5)
+
+
+def as_batch(problem: CoupledProblem) -> tuple:
+    """Return a problem in float32 as two models with two tapes each, unequal on purpose."""
+    chain, log_obs, *rest = problem.jax(np.float32)
+    other = jax.tree.map(lambda x: x[::-1], (chain.log_trans[0], chain.log_trans[1]))
+    chains = jax.tree.map(lambda x, y: jnp.stack([x, y]), chain, CoupledChain(chain.log_init, other))
+    tapes = jax.tree.map(lambda x: jnp.stack([jnp.stack([x, x[::-1]])] * 2), (log_obs, *rest))
+    return (chains, *tapes)
+
+
+@pytest.mark.parametrize("options", [{}, {"zeros": 0.4}, {"starts": 0.4, "missing": 0.4, "padding": 1}])
+def test_plans_agree(options: dict) -> None:
+    arguments = as_batch(random_coupled(1, **options))
+    one, other = (coupled_posterior(*arguments, plan=plan) for plan in ("scan", "pairs"))
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxpomdp.structure.coupled_spec import CoupledSpec, StrandSpec
 from jaxpomdp.structure.evidence import ReturnEvidence, even_edges, return_evidence
-from jaxpomdp.structure.spec import Channel, FlatSpec
+from jaxpomdp.structure.spec import Channel, FlatSpec, safe_log
 
 
 def random_spec(
@@ -25,6 +26,23 @@ def random_spec(
         rng.normal(size=columns).astype(dtype),
         rng.gamma(2, size=columns).astype(dtype),
     )
+
+
+def random_coupled(
+    seed: int, sizes: tuple[int, int], mixture: bool, a: int = 2, columns: int = 1, dtype: type = np.float64
+) -> CoupledSpec:
+    """Draw a coupled model: strand 0 sees one of 3 symbols, strand 1 emits a return."""
+    rng = np.random.default_rng(seed)
+
+    def rows(*shape: int) -> np.ndarray:
+        return safe_log(rng.dirichlet(np.ones(shape[-1]), shape[:-1])).astype(dtype)
+
+    n, m = sizes
+    seen = StrandSpec(rows(n), (Channel("Categorical", {"log_prob": rows(n, 3)}),))
+    mean, var = rng.normal(size=(m, columns)), rng.gamma(2, size=(m, columns))
+    paid = StrandSpec(rows(m), (), mean.astype(dtype), var.astype(dtype))
+    pairs = ((rows(a, n, n), rows(a, m, n)), (rows(a, n, m), rows(a, m, m)))
+    return CoupledSpec((seen, paid), pairs, rows(2, 2) if mixture else None, rows(a, n, n))
 
 
 def log_evidence(spec: FlatSpec, observations: np.ndarray, actions: np.ndarray) -> float:
