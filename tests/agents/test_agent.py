@@ -82,14 +82,9 @@ def outcomes(row):
     }
 
 
-def test_a_run_compiles_each_function_once_or_twice(run):
-    assert dict(zip((f.__name__ for f in COMPILED), run.compiled.tolist(), strict=True)) == {
-        "_run": 1,
-        "refit": 1,
-        "replay": 1,
-        "gather_evidence": 1,
-        "with_returns": 1,
-    }
+def test_a_run_compiles_each_function_at_most_once(run):
+    compiled = dict(zip((f.__name__ for f in COMPILED), run.compiled.tolist(), strict=True))
+    assert max(compiled.values()) == 1, compiled
 
 
 def test_rows_have_one_number_a_trial(run):
