@@ -37,7 +37,7 @@ THESIS = AgentConfig(
 """As thesis section 3.5.3 says, with Loch and Singh's alpha and epsilon, and a lambda just above theirs."""
 
 TMAZE = AgentConfig(
-    ControlConfig(alpha=0.03, gamma=0.98, lam=0.98, schedule=Schedule(0.2, 0.0, 20_000), sticky=0.9),
+    ControlConfig(alpha=0.03, gamma=0.98, lam=0.98, schedule=Schedule(0.2, 0.05, 20_000), sticky=0.9),
     LearnerConfig(
         states=8,
         theta=0.2,
@@ -50,7 +50,7 @@ TMAZE = AgentConfig(
         gate=0.3,
         keep_best=60,
         revert_margin=0.0,
-        patience=200,
+        patience=100,
         split=SplitConfig(stay=0.9),
         policy=PolicyConfig(node_cap=20, edits_per_phase=1),
     ),
