@@ -225,7 +225,7 @@ def test_settings_that_are_no_settings_are_refused():
         with_settings(UDHMM, {"thta": 1.0})
     with pytest.raises(ValueError, match="theta must be at least 0, got -1"):
         make_agent("udhmm", WORLD, theta=-1)
-    with pytest.raises(ValueError, match="agent must be one of pda, udhmm"):
+    with pytest.raises(ValueError, match=r"agent must be one of cudhmm, .*pda, udhmm"):
         make_agent("udhm", WORLD)
     with pytest.raises(ValueError, match=r"config\.learner must be given where no fixed model is"):
         Agent(WORLD, AgentConfig(learner=None))
