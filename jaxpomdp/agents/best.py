@@ -67,9 +67,9 @@ def judged(best: Best, recent: np.ndarray, params: Any, q: Array, trials: int) -
     """Keep the policy of now where it stands better after the ``recent[S, K]`` trials than any did so far."""
     average, error = standing(recent)
     better = np.where(np.isnan(average), -np.inf, average) > best.score
-    kept = select(better, (params, q), (best.params, best.q))
+    kept, values = select(better, (params, q), (best.params, best.q))
     score, error = (np.where(better, x, y) for x, y in ((average, best.score), (error, best.error)))
-    return Best(*kept, score, error, np.where(better, 0, best.age + trials))
+    return Best(kept, values, score, error, np.where(better, 0, best.age + trials))
 
 
 def clearly_worse(best: Best, recent: np.ndarray, margin: float) -> np.ndarray:
