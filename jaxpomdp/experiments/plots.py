@@ -6,6 +6,7 @@ Matplotlib is loaded when a picture is made, and no window is needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#1864ab", "#e8590c", "#2b8a3e", "#862e9c", "#c92a2a", "#0b7285", "#846358", "#5f6b76")
-BAR_COLOURS = ("#4c7fb0", "#c3d3e3", "#e3b98f", "#efe0cf")
+BAR_COLOURS = ("#4c7fb0", "#c3d3e3", "#e3b98f", "#efe0cf", "#8fae8b", "#d5e3cf", "#b09ac0", "#e2d8ea")
 INK, PALE, GRID = "#212529", "#868e96", "#e9ecef"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -122,7 +123,7 @@ def learning_curves(
         title: above all panels.
         xlabel: of the common axis.
     """
-    figure, grid = new_figure(4.6 * len(panels) + 0.4, 3.9, 1, len(panels), squeeze=False)
+    figure, grid = new_figure(max(4.6 * len(panels) + 0.4, 8.6), 3.9, 1, len(panels), squeeze=False)
     for ax, (ylabel, curves, lines) in zip(grid[0], panels, strict=True):
         for curve, colour in zip(curves, _colours(len(curves)), strict=True):
             _draw_curve(ax, curve, colour)
@@ -219,9 +220,9 @@ def bars(
     top: int,
 ) -> Path:
     """Draw counts out of ``top`` as bars with their intervals, one group of bars at each place."""
-    figure, ax = new_figure(max(1.1 * len(places) + 1.6, 5), 3.8)
+    figure, ax = new_figure(max((0.5 + 0.3 * len(groups)) * len(places) + 1.6, 6.5), 3.8)
     width = 0.8 / len(groups)
-    for i, (group, colour) in enumerate(zip(groups, BAR_COLOURS, strict=False)):
+    for i, (group, colour) in enumerate(zip(groups, cycle(BAR_COLOURS), strict=False)):
         x = np.arange(len(places)) + (i - (len(groups) - 1) / 2) * width
         value, low, high = np.array(group.counts, dtype=float).T
         ax.bar(x, value, width * 0.92, color=colour, label=group.label)

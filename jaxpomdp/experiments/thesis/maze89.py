@@ -29,7 +29,7 @@ def draw_curves(
 ) -> Path:
     """Draw a score of the greedy tests against trials, the run of median goal % thick."""
     curves = [curve(m, metric) for m in measured if m.run is not None]
-    title = "89-state maze: greedy tests while learning, the median run and the middle half of the runs"
+    title = "89-state maze: greedy tests while learning; median run, middle half of the runs"
     return learning_curves([(ylabel, curves, lines)], path, title=title, xlabel="training trials")
 
 
