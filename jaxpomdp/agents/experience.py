@@ -125,6 +125,10 @@ class Tapes(NamedTuple):
     trial: np.ndarray
 
 
+LONG = 4096
+"""Rows double in length up to here; beyond, padding costs gigabytes, and another compilation is cheaper."""
+
+
 def tapes_of(store: Experience, *, least: int = 256) -> Tapes:
     """Lay the trials of every seed end to end on rows of one length, none cut in two.
 
@@ -132,7 +136,7 @@ def tapes_of(store: Experience, *, least: int = 256) -> Tapes:
     most steps needs (in buckets), so shapes are few and padding is little.
     """
     longest = int(store.lengths.max(initial=1))
-    width = bucket(longest, least=least, step=2.0)
+    width = bucket(longest, least=least, step=2.0 if longest <= LONG else 1.25)
     places = [_places(lengths[lengths > 0], width) for lengths in store.lengths]
     rows = bucket(
         max(int(where[-1]) // width + 1 if len(where) else 1 for where in places), least=8, step=1.25
