@@ -186,7 +186,7 @@ def test_a_log_is_cut_where_trials_ended():
 
 
 def test_rows_of_very_long_trials_are_not_half_empty():
-    """A trial just over a power of two once doubled every array: the T-maze of length 200 ran out of memory."""
+    """A trial just over a power of two doubled every array, and a T-maze of length 200 ran out of memory."""
     store = experience.no_experience(1, 2, (np.int32(0), np.zeros(2, np.float32)))
     store = experience.remember(store, [trials_of([4101, 4101], 0)])
     tapes = experience.tapes_of(store)
