@@ -14,6 +14,10 @@ LEAST_MASS = 1e-9
 """Share of the total weight under which a component keeps its old mean and variance."""
 
 
+NEGLIGIBLE = 1e-100
+"""Share of the weight below which a value is as good as absent: variances made of it would underflow."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mixture:
     """``p(x) = sum_j weight[j] N(x; mean[j], var[j])``, components by rising mean, and how well it fits.
@@ -91,7 +95,8 @@ def fit_mixture(
     _check(values, weights, components, restarts, rng)
     total = float(weights.sum())
     if total > 0:
-        values, weights = values[weights > 0], weights[weights > 0]
+        present = weights > NEGLIGIBLE * total
+        values, weights = values[present], weights[present]
     share = weights / (total or 1.0)
     floor = _floor(values, share, variance_floor)
     starts = [_quantile_centres(values, share, components), _far_centres(values, share, components)]

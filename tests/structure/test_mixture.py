@@ -97,6 +97,12 @@ def test_any_data_give_a_mixture(rows: list[tuple[float, float]], components: in
     assert np.isfinite(fit.log_likelihood)
 
 
+def test_a_value_of_next_to_no_weight_is_absent() -> None:
+    fit = fit_mixture(np.array([0.0, 3.0]), np.array([1.0, 5e-324]), 1)
+    alone = fit_mixture(np.array([0.0]), np.array([1.0]), 1)
+    np.testing.assert_array_equal([fit.weight, fit.mean, fit.var], [alone.weight, alone.mean, alone.var])
+
+
 def test_a_rare_lump_is_found() -> None:
     fit = fit_mixture(np.array([0.0, 4.0]), np.array([99.0, 1.0]), 2)
     np.testing.assert_allclose(fit.mean, [0, 4], atol=1e-6)
