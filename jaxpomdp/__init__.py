@@ -95,6 +95,10 @@ if TYPE_CHECKING:
     from jaxpomdp.models.full_gaussian import FullGaussian as FullGaussian
     from jaxpomdp.models.gradient import GradientConfig as GradientConfig
     from jaxpomdp.models.gradient import fit_gradient as fit_gradient
+    from jaxpomdp.models.hierarchical import HIERARCHICAL as HIERARCHICAL
+    from jaxpomdp.models.hierarchical import TreeParams as TreeParams
+    from jaxpomdp.models.hierarchical import beliefs_of_nodes as beliefs_of_nodes
+    from jaxpomdp.models.hierarchical import path_of_nodes as path_of_nodes
     from jaxpomdp.models.init import Real as Real
     from jaxpomdp.models.init import observation_seeded as observation_seeded
     from jaxpomdp.models.init import random_params as random_params
@@ -113,6 +117,13 @@ if TYPE_CHECKING:
     from jaxpomdp.structure.policy import revise as revise
     from jaxpomdp.structure.spec import FlatSpec as FlatSpec
     from jaxpomdp.structure.splits import SplitConfig as SplitConfig
+    from jaxpomdp.structure.tree import TreeSpec as TreeSpec
+    from jaxpomdp.structure.tree_forms import flatten_tree as flatten_tree
+    from jaxpomdp.structure.tree_forms import maximal as maximal
+    from jaxpomdp.structure.tree_forms import minimal as minimal
+    from jaxpomdp.structure.tree_forms import one_level as one_level
+    from jaxpomdp.structure.tree_init import random_tree as random_tree
+    from jaxpomdp.structure.tree_init import tree_over as tree_over
 
 __version__ = "0.1.0"
 
@@ -141,6 +152,7 @@ _HOMES = {
     "FullGaussian": "jaxpomdp.models.full_gaussian",
     "GradientConfig": "jaxpomdp.models.gradient",
     "GymAgent": "jaxpomdp.agents.gym_agent",
+    "HIERARCHICAL": "jaxpomdp.models.hierarchical",
     "Kind": "jaxpomdp.agents.kinds",
     "LearnerConfig": "jaxpomdp.agents.learner",
     "ParsedPOMDP": "jaxpomdp.envs.pomdp_tables",
@@ -157,9 +169,12 @@ _HOMES = {
     "Schedule": "jaxpomdp.agents.control",
     "SplitConfig": "jaxpomdp.structure.splits",
     "Step": "jaxpomdp.envs.world",
+    "TreeParams": "jaxpomdp.models.hierarchical",
+    "TreeSpec": "jaxpomdp.structure.tree",
     "TrialBatch": "jaxpomdp._types",
     "TrueModel": "jaxpomdp.envs.world",
     "World": "jaxpomdp.envs.world",
+    "beliefs_of_nodes": "jaxpomdp.models.hierarchical",
     "bic": "jaxpomdp.models.selection",
     "couple": "jaxpomdp.models.coupled_init",
     "draw": "jaxpomdp.envs.drawing",
@@ -170,6 +185,7 @@ _HOMES = {
     "fit": "jaxpomdp.models.em",
     "fit_gradient": "jaxpomdp.models.gradient",
     "fit_restarts": "jaxpomdp.models.selection",
+    "flatten_tree": "jaxpomdp.structure.tree_forms",
     "from_pomdp": "jaxpomdp.envs.pomdp_world",
     "hallway": "jaxpomdp.envs.hallway",
     "hallway_navigation": "jaxpomdp.envs.hallway",
@@ -181,14 +197,18 @@ _HOMES = {
     "log_evidence": "jaxpomdp.models.selection",
     "make": "jaxpomdp.envs.registry",
     "make_agent": "jaxpomdp.agents.agent",
+    "maximal": "jaxpomdp.structure.tree_forms",
     "maze57": "jaxpomdp.envs.maze89",
     "maze89": "jaxpomdp.envs.maze89",
+    "minimal": "jaxpomdp.structure.tree_forms",
     "model_of": "jaxpomdp.envs.world",
     "noisy": "jaxpomdp.envs.wrappers",
     "observation_seeded": "jaxpomdp.models.init",
     "observe": "jaxpomdp.kernels.filtering",
+    "one_level": "jaxpomdp.structure.tree_forms",
     "pack": "jaxpomdp.packing",
     "pack_coupled": "jaxpomdp.coupled_packing",
+    "path_of_nodes": "jaxpomdp.models.hierarchical",
     "perseus": "jaxpomdp.kernels.planning",
     "plan": "jaxpomdp.agents.planners",
     "posterior": "jaxpomdp.kernels.posterior",
@@ -196,6 +216,7 @@ _HOMES = {
     "predict_observation": "jaxpomdp.kernels.filtering",
     "predict_steps": "jaxpomdp.kernels.filtering",
     "random_params": "jaxpomdp.models.init",
+    "random_tree": "jaxpomdp.structure.tree_init",
     "read_pomdp": "jaxpomdp.envs.pomdp_file",
     "read_pomdpx": "jaxpomdp.envs.pomdpx",
     "reset": "jaxpomdp.envs.world",
@@ -213,6 +234,7 @@ _HOMES = {
     "tiger_grid": "jaxpomdp.envs.maze89",
     "tmaze": "jaxpomdp.envs.tmaze",
     "to_pomdp": "jaxpomdp.envs.pomdp_world",
+    "tree_over": "jaxpomdp.structure.tree_init",
     "trial_batch": "jaxpomdp.models.data",
     "unpack": "jaxpomdp.packing",
     "unpack_coupled": "jaxpomdp.coupled_packing",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,11 @@ from jaxpomdp._types import Array
 from jaxpomdp.models.emission import Categorical, DiagonalGaussian, ReturnModel
 from jaxpomdp.models.flat import FlatParams
 from jaxpomdp.models.full_gaussian import FullGaussian
-from jaxpomdp.numerics import NEG
+from jaxpomdp.models.hierarchical import TreeParams
+from jaxpomdp.numerics import NEG, bucket
 from jaxpomdp.structure.spec import Channel, FlatSpec
+from jaxpomdp.structure.topology import paths_of
+from jaxpomdp.structure.tree import TreeSpec
 
 CHANNELS = {kind.__name__: kind for kind in (Categorical, DiagonalGaussian, FullGaussian)}
 """Emission classes by the name that a spec's ``Channel.kind`` gives them."""
@@ -29,33 +32,99 @@ CHANNELS = {kind.__name__: kind for kind in (Categorical, DiagonalGaussian, Full
 Tree = TypeVar("Tree")
 
 
-def pack(specs: Sequence[FlatSpec], capacity: int) -> FlatParams:
+class TreeCapacity(NamedTuple):
+    """Slots for the leaves and the internal states of trees, and the depth there is room for."""
+
+    leaves: int
+    internal: int
+    levels: int
+
+
+def room_for(specs: Sequence[TreeSpec], leaves: int) -> TreeCapacity:
+    """Return slots for growing trees: internal states and levels in buckets, so that shapes change rarely."""
+    internal = max((spec.num_internal for spec in specs), default=1)
+    levels = max((int(spec.depth.max()) for spec in specs), default=1)
+    return TreeCapacity(leaves, bucket(internal), bucket(levels, least=4, step=1.5))
+
+
+@overload
+def pack(specs: Sequence[FlatSpec], capacity: int) -> FlatParams: ...
+@overload
+def pack(specs: Sequence[TreeSpec], capacity: int | TreeCapacity) -> TreeParams: ...
+def pack(
+    specs: Sequence[FlatSpec] | Sequence[TreeSpec], capacity: int | TreeCapacity
+) -> FlatParams | TreeParams:
     """Return the models as one pytree of arrays with leading ``[S]`` and ``capacity`` slots for states.
 
     The numbers keep their type where the device has it, so ``unpack(pack(specs, capacity), s) == specs[s]``.
+    Trees of any shapes fit one capacity; a number is that of leaves (``room_for`` makes room for the rest).
 
     Raises:
         ValueError: no specs, more states than slots, or specs with other actions, channels or returns.
     """
     _check_alike(specs)
+    if isinstance(specs[0], TreeSpec):
+        return _pack_trees(specs, room_for(specs, capacity) if isinstance(capacity, int) else capacity)
     slots, alive = slots_of([np.arange(spec.num_states) for spec in specs], capacity)
+    emissions, returns = _padded_leaves(specs, slots)
+    log_init = np.where(
+        alive, _read([spec.log_init for spec in specs], slots), _like([spec.log_trans for spec in specs], NEG)
+    )
+    log_trans = _padded_transitions(specs, capacity)
+    return jax.device_put(FlatParams(log_init, log_trans, emissions, returns, alive))
 
-    def padded(parts: Sequence[np.ndarray]) -> np.ndarray:
-        return np.stack([part[index] for part, index in zip(parts, slots, strict=True)])
 
+def _read(parts: Sequence[np.ndarray], slots: np.ndarray) -> np.ndarray:
+    return np.stack([part[index] for part, index in zip(parts, slots, strict=True)])
+
+
+def _padded_leaves(specs: Sequence[Any], slots: np.ndarray) -> tuple[tuple[Any, ...], ReturnModel]:
+    """Return the emissions and the returns of the states in each slot."""
     emissions = tuple(
         CHANNELS[channel.kind](
-            **{name: padded([spec.emissions[c].values[name] for spec in specs]) for name in channel.values}
+            **{
+                name: _read([spec.emissions[c].values[name] for spec in specs], slots)
+                for name in channel.values
+            }
         )
         for c, channel in enumerate(specs[0].emissions)
     )
-    log_init = np.where(alive, padded([spec.log_init for spec in specs]), _like(specs, NEG))
-    mean, var = (padded([getattr(spec, name) for spec in specs]) for name in ("return_mean", "return_var"))
-    log_trans = _padded_transitions(specs, capacity)
-    return jax.device_put(FlatParams(log_init, log_trans, emissions, ReturnModel(mean, var), alive))
+    mean, var = (
+        _read([getattr(spec, name) for spec in specs], slots) for name in ("return_mean", "return_var")
+    )
+    return emissions, ReturnModel(mean, var)
 
 
-def unpack(params: FlatParams, s: int) -> FlatSpec:
+def _pack_trees(specs: Sequence[TreeSpec], capacity: TreeCapacity) -> TreeParams:
+    slots, alive = slots_of([np.arange(spec.num_states) for spec in specs], capacity.leaves)
+    most = max(spec.num_internal for spec in specs)
+    if most > capacity.internal:
+        raise ValueError(f"capacity must hold {most} internal states, got {capacity.internal}")
+    models, nodes, actions = len(specs), capacity.leaves + capacity.internal, specs[0].num_actions
+    tables, absent = specs[0].log_vertical.shape[0], _like([spec.log_horizontal for spec in specs], NEG)
+    vertical = np.full((models, tables, capacity.internal, nodes), absent)
+    horizontal = np.full((models, actions, nodes, nodes + 1), absent)
+    path = np.full((models, capacity.leaves, capacity.levels + 1), -1, np.int32)
+    for s, spec in enumerate(specs):
+        place = _places(spec, capacity.leaves)
+        vertical[s][:, : spec.num_internal, place] = spec.log_vertical
+        horizontal[s][:, place[:, None], np.append(place, nodes)[None]] = spec.log_horizontal
+        ways = paths_of(spec.parent, spec.num_states, capacity.levels)
+        path[s, : spec.num_states] = np.where(ways < 0, -1, place[np.maximum(ways, 0)])
+    emissions, returns = _padded_leaves(specs, slots)
+    return jax.device_put(TreeParams(vertical, horizontal, path, emissions, returns, alive))
+
+
+def _places(spec: TreeSpec, leaves: int) -> np.ndarray:
+    """Return ``[M]``: the padded number of every node; internal states begin after all slots of leaves."""
+    return np.concatenate([np.arange(spec.num_states), leaves + np.arange(spec.num_internal)])
+
+
+@overload
+def unpack(params: FlatParams, s: int) -> FlatSpec: ...
+@overload
+def unpack(params: TreeParams, s: int) -> TreeSpec: ...
+def unpack(params: FlatParams | TreeParams, s: int) -> FlatSpec | TreeSpec:
     """Return model ``s`` of packed models as a spec.
 
     Raises:
@@ -67,7 +136,11 @@ def unpack(params: FlatParams, s: int) -> FlatSpec:
     return _spec_of(jax.device_get(params), s)
 
 
-def unpack_all(params: FlatParams) -> list[FlatSpec]:
+@overload
+def unpack_all(params: FlatParams) -> list[FlatSpec]: ...
+@overload
+def unpack_all(params: TreeParams) -> list[TreeSpec]: ...
+def unpack_all(params: FlatParams | TreeParams) -> list[FlatSpec] | list[TreeSpec]:
     """Return every model as a spec; the arrays leave the device once.
 
     Raises:
@@ -75,7 +148,7 @@ def unpack_all(params: FlatParams) -> list[FlatSpec]:
     """
     _expect_leading_axis(params)
     host = jax.device_get(params)
-    return [_spec_of(host, s) for s in range(host.alive.shape[0])]
+    return [_spec_of(host, s) for s in range(host.alive.shape[0])]  # type: ignore[return-value]
 
 
 def carry(values: Tree, origins: Sequence[np.ndarray], capacity: int, axis: int = 1) -> Tree:
@@ -129,38 +202,55 @@ def _carry(values: Any, slots: Array, alive: Array, axis: int) -> Any:
 
 
 def _padded_transitions(specs: Sequence[FlatSpec], capacity: int) -> np.ndarray:
-    padded = np.full((len(specs), specs[0].num_actions, capacity, capacity), _like(specs, NEG))
+    padded = np.full(
+        (len(specs), specs[0].num_actions, capacity, capacity), _like([spec.log_trans for spec in specs], NEG)
+    )
     for row, spec in zip(padded, specs, strict=True):
         row[:, : spec.num_states, : spec.num_states] = spec.log_trans
     return padded
 
 
-def _like(specs: Sequence[FlatSpec], number: float) -> np.floating:
-    return np.result_type(*(spec.log_trans for spec in specs)).type(number)
+def _like(tables: Sequence[np.ndarray], number: float) -> np.floating:
+    return np.result_type(*tables).type(number)
 
 
-def _spec_of(params: FlatParams, s: int) -> FlatSpec:
+def _spec_of(params: Any, s: int) -> Any:
     """Return the spec of one model of arrays on the host."""
     alive = np.flatnonzero(params.alive[s])
-    channels = (
+    channels = tuple(
         Channel(type(channel).__name__, {f.name: getattr(channel, f.name)[s][alive] for f in fields(channel)})
         for channel in params.emissions
     )
-    return FlatSpec(
-        params.log_init[s][alive],
-        params.log_trans[s][:, alive][:, :, alive],
-        tuple(channels),
-        params.returns.mean[s][alive],
-        params.returns.var[s][alive],
-    )
+    leaves = (channels, params.returns.mean[s][alive], params.returns.var[s][alive])
+    if isinstance(params, TreeParams):
+        return TreeSpec(*_tree_of(params, s), *leaves)
+    return FlatSpec(params.log_init[s][alive], params.log_trans[s][:, alive][:, :, alive], *leaves)
 
 
-def _expect_leading_axis(params: FlatParams) -> None:
+def _tree_of(params: TreeParams, s: int) -> tuple[np.ndarray, ...]:
+    """Return ``leaf_parent``, ``node_parent`` and the two tables of one model, without spare slots."""
+    path, slots = params.path[s], params.path.shape[-2]
+    alive = np.flatnonzero(params.alive[s])
+    used = np.unique(path[path >= slots])
+    above = np.full(params.log_horizontal.shape[-2], -1)
+    for depth in range(path.shape[1] - 1):
+        here = path[:, depth + 1] >= 0
+        above[path[here, depth + 1]] = path[here, depth]
+    number = np.full(len(above) + 1, -1)
+    number[used] = np.arange(len(used))
+    place = np.concatenate([alive, used])
+    columns = np.append(place, len(above))
+    vertical = params.log_vertical[s][:, used - slots][:, :, place]
+    horizontal = params.log_horizontal[s][:, place][:, :, columns]
+    return number[above[alive]], number[above[used]], vertical, horizontal
+
+
+def _expect_leading_axis(params: Any) -> None:
     if params.alive.ndim != 2:
         raise ValueError(f"params must have a leading axis [S], got alive of shape {params.alive.shape}")
 
 
-def _check_alike(specs: Sequence[FlatSpec]) -> None:
+def _check_alike(specs: Sequence[Any]) -> None:
     if not specs:
         raise ValueError("specs must hold at least one model, got none")
     for s, spec in enumerate(specs):
@@ -172,8 +262,10 @@ def _check_alike(specs: Sequence[FlatSpec]) -> None:
         raise ValueError(f"channels must be of kinds {', '.join(CHANNELS)}, got {', '.join(unknown)}")
 
 
-def _form(spec: FlatSpec) -> str:
+def _form(spec: Any) -> str:
     """Describe what the specs of one pack have in common."""
     channels = [c.kind + str({name: v.shape[1:] for name, v in c.values.items()}) for c in spec.emissions]
     columns = spec.return_mean.shape[1]
-    return f"{spec.num_actions} actions, {columns} return columns, channels {', '.join(channels) or 'none'}"
+    kind = f"tree with {len(spec.log_vertical)} vertical tables, " if isinstance(spec, TreeSpec) else ""
+    counts = f"{spec.num_actions} actions, {columns} return columns"
+    return f"{kind}{counts}, channels {', '.join(channels) or 'none'}"

@@ -42,30 +42,40 @@ def check_batch(batch: TrialBatch, actions: int) -> None:
         raise ValueError("batch.returns must be finite where has_return, got NaN or infinity")
 
 
+def check_leaves(params: Any) -> None:
+    """Refuse parameters whose emissions and returns do not fit their states (any leading axes).
+
+    Raises:
+        ValueError: naming the field.
+    """
+    alive = np.asarray(params.alive)
+    if not alive.any(axis=-1).all():
+        raise ValueError("params.alive must hold at least one state of every model, got none")
+    stop_if_not_finite("params", params)
+    for path, leaf in jax.tree_util.tree_leaves_with_path((params.emissions, params.returns)):
+        if tuple(leaf.shape[: alive.ndim]) != alive.shape:
+            name = f"params (emissions, returns){jax.tree_util.keystr(path)}"
+            raise ValueError(f"{name} must have a shape that starts with {alive.shape}, got {leaf.shape}")
+    check_positive("params.returns.var", params.returns.var, alive)
+    for index, channel in enumerate(params.emissions):
+        channel.check_params(alive, f"params.emissions[{index}]")
+
+
 def check_params(params: Any) -> None:
     """Refuse flat parameters (any leading axes) that disagree in shape or are no probabilities.
 
     Raises:
         ValueError: naming the field.
     """
+    check_leaves(params)
     alive = np.asarray(params.alive)
     lead, states = alive.shape[:-1], alive.shape[-1]
-    if not alive.any(axis=-1).all():
-        raise ValueError("params.alive must hold at least one state of every model, got none")
-    stop_if_not_finite("params", params)
     actions = params.log_trans.shape[-3]
     _shape("params.log_init", params.log_init, (*lead, states))
     _shape("params.log_trans", params.log_trans, (*lead, actions, states, states))
-    for path, leaf in jax.tree_util.tree_leaves_with_path((params.emissions, params.returns)):
-        if tuple(leaf.shape[: alive.ndim]) != alive.shape:
-            name = f"params (emissions, returns){jax.tree_util.keystr(path)}"
-            raise ValueError(f"{name} must have a shape that starts with {alive.shape}, got {leaf.shape}")
     check_rows("params.log_init", params.log_init, np.ones(lead, bool))
     everywhere = np.broadcast_to(alive[..., None, :], (*lead, actions, states))
     check_rows("params.log_trans", params.log_trans, everywhere)
-    check_positive("params.returns.var", params.returns.var, alive)
-    for index, channel in enumerate(params.emissions):
-        channel.check_params(alive, f"params.emissions[{index}]")
 
 
 def check(params: Any, batch: TrialBatch) -> None:
@@ -75,10 +85,19 @@ def check(params: Any, batch: TrialBatch) -> None:
         ValueError: naming the argument, what was expected, and what came.
     """
     check_params(params)
-    check_batch(batch, params.log_trans.shape[-3])
-    if params.returns.mean.shape[-1] not in (1, params.log_trans.shape[-3]):
+    check_data(params, batch, params.log_trans.shape[-3])
+
+
+def check_data(params: Any, batch: TrialBatch, actions: int) -> None:
+    """Refuse a batch that does not fit a model of production states: its channels, returns, actions.
+
+    Raises:
+        ValueError: naming the argument, what was expected, and what came.
+    """
+    check_batch(batch, actions)
+    if params.returns.mean.shape[-1] not in (1, actions):
         raise ValueError(
-            f"params.returns must have 1 or {params.log_trans.shape[-3]} columns (one per action), "
+            f"params.returns must have 1 or {actions} columns (one per action), "
             f"got {params.returns.mean.shape[-1]}"
         )
     if len(params.emissions) != len(batch.observations):

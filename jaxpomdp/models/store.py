@@ -25,12 +25,22 @@ from jaxpomdp.models.coupled import CoupledParams, Strand
 from jaxpomdp.models.emission import Categorical, DiagonalGaussian, ReturnModel
 from jaxpomdp.models.flat import FlatParams
 from jaxpomdp.models.full_gaussian import FullGaussian
+from jaxpomdp.models.hierarchical import TreeParams
 
 FORMAT = "jaxpomdp.params"
 VERSION = 1
 KINDS: dict[str, type] = {
     cls.__name__: cls
-    for cls in (FlatParams, CoupledParams, Strand, Categorical, DiagonalGaussian, FullGaussian, ReturnModel)
+    for cls in (
+        FlatParams,
+        TreeParams,
+        CoupledParams,
+        Strand,
+        Categorical,
+        DiagonalGaussian,
+        FullGaussian,
+        ReturnModel,
+    )
 }
 """The classes that files may name. Other families add theirs with ``register``."""
 _NUMBERS = "biuf"

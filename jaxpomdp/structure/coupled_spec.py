@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jaxpomdp.structure.spec import Channel, exits_line, expect_shape, frozen, stop_if_bad_rows
+from jaxpomdp.structure.spec import Channel, exits_line, expect_rows, expect_shape, frozen
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +155,11 @@ def validate(spec: CoupledSpec) -> None:
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise ValueError(f"{name} must be finite, got NaN or infinity at {where}")
         if name.endswith(("log_init", "log_prob")):
-            stop_if_bad_rows(name, array)
+            expect_rows(name, array)
         if name.endswith("return_var") and not (array > 0).all():
             raise ValueError(f"{name} must be positive, got {array.min()}")
     for name, array in spec.tables():
-        stop_if_bad_rows(name, array)
+        expect_rows(name, array)
 
 
 def _check_strand(strand: StrandSpec) -> None:

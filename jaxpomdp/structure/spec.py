@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -77,7 +78,7 @@ class Channel:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Channel):
             return NotImplemented
-        return self.kind == other.kind and _equal_maps(self.values, other.values)
+        return self.kind == other.kind and equal_maps(self.values, other.values)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -148,7 +149,7 @@ class FlatSpec:
         none = np.zeros((len(start), 1), start.dtype)
         mean = frozen("return_mean", none if return_mean is None else return_mean)
         var = frozen("return_var", np.ones_like(mean) if return_var is None else return_var)
-        channels = tuple(c if isinstance(c, Channel) else _table(c) for c in emissions)
+        channels = tuple(channel_of(c) for c in emissions)
         spec = FlatSpec(safe_log(start), safe_log(frozen("trans", trans)), channels, mean, var)
         validate(spec)
         return spec
@@ -156,7 +157,7 @@ class FlatSpec:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, FlatSpec):
             return NotImplemented
-        return self.emissions == other.emissions and _equal_maps(_arrays(self), _arrays(other))
+        return self.emissions == other.emissions and equal_maps(_arrays(self), _arrays(other))
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -174,28 +175,30 @@ def validate(spec: FlatSpec) -> None:
     Raises:
         ValueError: naming the array, the row, what was expected and what came.
     """
-    for name, array in (_arrays(spec) | _channel_arrays(spec)).items():
+    for name, array in (_arrays(spec) | channel_arrays(spec)).items():
         if not np.isfinite(array).all():
             raise ValueError(f"{name} must be finite, got NaN or infinity at {_first(~np.isfinite(array))}")
     for name, array in {"log_init": spec.log_init, "log_trans": spec.log_trans}.items():
-        stop_if_bad_rows(name, array)
-    for name, array in _channel_arrays(spec).items():
+        expect_rows(name, array)
+    for name, array in channel_arrays(spec).items():
         if name.endswith("log_prob"):
-            stop_if_bad_rows(name, array)
+            expect_rows(name, array)
     if not (spec.return_var > 0).all():
         raise ValueError(f"return_var must be positive, got {spec.return_var.min()}")
 
 
-def _table(probability: object) -> Channel:
-    """Return the categorical channel of a table ``[N, O]`` of probabilities."""
-    return Channel("Categorical", {"log_prob": safe_log(frozen("emission table", probability))})
+def channel_of(emission: object) -> Channel:
+    """Return a channel as it is, and a table ``[N, O]`` of probabilities as a categorical channel."""
+    if isinstance(emission, Channel):
+        return emission
+    return Channel("Categorical", {"log_prob": safe_log(frozen("emission table", emission))})
 
 
-def stop_if_bad_rows(name: str, log_prob: np.ndarray) -> None:
-    """Stop unless the probabilities of every last axis sum to one.
+def expect_rows(name: str, log_prob: np.ndarray) -> None:
+    """Stop unless the rows (last axis) are probabilities.
 
     Raises:
-        ValueError: naming the array, the sum and its row.
+        ValueError: naming the array, with the sum that came and its row.
     """
     totals = np.exp(log_prob).sum(-1)
     wrong = np.abs(totals - 1) > ROW_TOLERANCE
@@ -217,7 +220,7 @@ def _check_shapes(spec: FlatSpec) -> None:
             f"return_mean must have 1 or {spec.num_actions} columns (per state, or per state and action), "
             f"got {spec.return_mean.shape[1]}"
         )
-    for name, array in _channel_arrays(spec).items():
+    for name, array in channel_arrays(spec).items():
         expect_shape(name, array, (n, *array.shape[1:]))
 
 
@@ -225,12 +228,14 @@ def _arrays(spec: FlatSpec) -> dict[str, np.ndarray]:
     return {k: getattr(spec, k) for k in ("log_init", "log_trans", "return_mean", "return_var")}
 
 
-def _channel_arrays(spec: FlatSpec) -> dict[str, np.ndarray]:
+def channel_arrays(spec: Any) -> dict[str, np.ndarray]:
+    """Return the arrays of a spec's channels by a name that says which channel they are of."""
     named = enumerate(spec.emissions)
     return {f"emissions[{i}].{name}": array for i, c in named for name, array in c.values.items()}
 
 
-def _equal_maps(left: Mapping[str, np.ndarray], right: Mapping[str, np.ndarray]) -> bool:
+def equal_maps(left: Mapping[str, np.ndarray], right: Mapping[str, np.ndarray]) -> bool:
+    """Return whether two maps hold equal arrays under equal names."""
     return left.keys() == right.keys() and all(np.array_equal(left[k], right[k]) for k in left)
 
 
