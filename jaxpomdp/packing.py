@@ -51,9 +51,7 @@ def room_for(specs: Sequence[TreeSpec], leaves: int) -> TreeCapacity:
 def pack(specs: Sequence[FlatSpec], capacity: int) -> FlatParams: ...
 @overload
 def pack(specs: Sequence[TreeSpec], capacity: int | TreeCapacity) -> TreeParams: ...
-def pack(
-    specs: Sequence[FlatSpec] | Sequence[TreeSpec], capacity: int | TreeCapacity
-) -> FlatParams | TreeParams:
+def pack(specs: Sequence[Any], capacity: Any) -> FlatParams | TreeParams:
     """Return the models as one pytree of arrays with leading ``[S]`` and ``capacity`` slots for states.
 
     The numbers keep their type where the device has it, so ``unpack(pack(specs, capacity), s) == specs[s]``.
@@ -148,7 +146,7 @@ def unpack_all(params: FlatParams | TreeParams) -> list[FlatSpec] | list[TreeSpe
     """
     _expect_leading_axis(params)
     host = jax.device_get(params)
-    return [_spec_of(host, s) for s in range(host.alive.shape[0])]  # type: ignore[return-value]
+    return [_spec_of(host, s) for s in range(host.alive.shape[0])]
 
 
 def carry(values: Tree, origins: Sequence[np.ndarray], capacity: int, axis: int = 1) -> Tree:
@@ -221,13 +219,15 @@ def _spec_of(params: Any, s: int) -> Any:
         Channel(type(channel).__name__, {f.name: getattr(channel, f.name)[s][alive] for f in fields(channel)})
         for channel in params.emissions
     )
-    leaves = (channels, params.returns.mean[s][alive], params.returns.var[s][alive])
+    mean, var = params.returns.mean[s][alive], params.returns.var[s][alive]
     if isinstance(params, TreeParams):
-        return TreeSpec(*_tree_of(params, s), *leaves)
-    return FlatSpec(params.log_init[s][alive], params.log_trans[s][:, alive][:, :, alive], *leaves)
+        leaf_parent, node_parent, vertical, horizontal = _tree_of(params, s)
+        return TreeSpec(leaf_parent, node_parent, vertical, horizontal, channels, mean, var)
+    log_init, log_trans = params.log_init[s][alive], params.log_trans[s][:, alive][:, :, alive]
+    return FlatSpec(log_init, log_trans, channels, mean, var)
 
 
-def _tree_of(params: TreeParams, s: int) -> tuple[np.ndarray, ...]:
+def _tree_of(params: TreeParams, s: int) -> tuple[Any, Any, Any, Any]:
     """Return ``leaf_parent``, ``node_parent`` and the two tables of one model, without spare slots."""
     path, slots = params.path[s], params.path.shape[-2]
     alive = np.flatnonzero(params.alive[s])

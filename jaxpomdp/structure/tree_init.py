@@ -99,8 +99,8 @@ def tree_over(
     horizontal = _random_rows(rng, allowed_horizontal(shape), a, concentration)
     if tables > 1:
         vertical[:-1, 0] = 0
-    logs = (safe_log(table).astype(dtype) for table in (vertical, horizontal))
-    return TreeSpec(*parents, *logs, flat.emissions, flat.return_mean, flat.return_var)
+    down, along = safe_log(vertical).astype(dtype), safe_log(horizontal).astype(dtype)
+    return TreeSpec(*parents, down, along, flat.emissions, flat.return_mean, flat.return_var)
 
 
 def random_shape(rng: np.random.Generator, states: int, levels: int, form: Form = "diverse") -> list[Any]:
