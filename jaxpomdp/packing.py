@@ -65,6 +65,10 @@ def pack(
     _check_alike(specs)
     if isinstance(specs[0], TreeSpec):
         return _pack_trees(specs, room_for(specs, capacity) if isinstance(capacity, int) else capacity)
+    return _pack_flat(specs, capacity)
+
+
+def _pack_flat(specs: Sequence[Any], capacity: Any) -> FlatParams:
     slots, alive = slots_of([np.arange(spec.num_states) for spec in specs], capacity)
     emissions, returns = _padded_leaves(specs, slots)
     log_init = np.where(
@@ -148,7 +152,7 @@ def unpack_all(params: FlatParams | TreeParams) -> list[FlatSpec] | list[TreeSpe
     """
     _expect_leading_axis(params)
     host = jax.device_get(params)
-    return [_spec_of(host, s) for s in range(host.alive.shape[0])]  # type: ignore[return-value]
+    return [_spec_of(host, s) for s in range(host.alive.shape[0])]
 
 
 def carry(values: Tree, origins: Sequence[np.ndarray], capacity: int, axis: int = 1) -> Tree:
@@ -223,11 +227,12 @@ def _spec_of(params: Any, s: int) -> Any:
     )
     leaves = (channels, params.returns.mean[s][alive], params.returns.var[s][alive])
     if isinstance(params, TreeParams):
-        return TreeSpec(*_tree_of(params, s), *leaves)
+        leaf_parent, node_parent, vertical, horizontal = _tree_of(params, s)
+        return TreeSpec(leaf_parent, node_parent, vertical, horizontal, *leaves)
     return FlatSpec(params.log_init[s][alive], params.log_trans[s][:, alive][:, :, alive], *leaves)
 
 
-def _tree_of(params: TreeParams, s: int) -> tuple[np.ndarray, ...]:
+def _tree_of(params: Any, s: int) -> tuple[np.ndarray, ...]:
     """Return ``leaf_parent``, ``node_parent`` and the two tables of one model, without spare slots."""
     path, slots = params.path[s], params.path.shape[-2]
     alive = np.flatnonzero(params.alive[s])

@@ -142,12 +142,13 @@ def _read(spec: TreeSpec, copied: Copied) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _grown(spec: TreeSpec, copied: Copied, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
-    logs = (safe_log(t).astype(spec.log_vertical.dtype) for t in (vertical, horizontal))
+    dtype = spec.log_vertical.dtype
     leaves = copied.leaf_origin
     return TreeSpec(
         copied.leaf_parent,
         copied.node_parent,
-        *logs,
+        safe_log(vertical).astype(dtype),
+        safe_log(horizontal).astype(dtype),
         tuple(channel.take(leaves) for channel in spec.emissions),
         spec.return_mean[leaves],
         spec.return_var[leaves],
