@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jaxpomdp.agents.planners import plan as plan
     from jaxpomdp.agents.policies import Policy as Policy
     from jaxpomdp.agents.policies import evaluate_policy as evaluate_policy
+    from jaxpomdp.agents.tree_evidence import gather_tree_evidence as gather_tree_evidence
     from jaxpomdp.coupled_packing import pack_coupled as pack_coupled
     from jaxpomdp.coupled_packing import unpack_coupled as unpack_coupled
     from jaxpomdp.envs.drawing import draw as draw
@@ -108,22 +109,26 @@ if TYPE_CHECKING:
     from jaxpomdp.models.selection import log_evidence as log_evidence
     from jaxpomdp.models.store import load as load
     from jaxpomdp.models.store import save as save
+    from jaxpomdp.packing import TreeCapacity as TreeCapacity
     from jaxpomdp.packing import pack as pack
     from jaxpomdp.packing import unpack as unpack
     from jaxpomdp.structure.coupled_spec import CoupledSpec as CoupledSpec
     from jaxpomdp.structure.evidence import ReturnEvidence as ReturnEvidence
     from jaxpomdp.structure.evidence import return_evidence as return_evidence
+    from jaxpomdp.structure.operators import TREE_SPLITS as TREE_SPLITS
     from jaxpomdp.structure.policy import PolicyConfig as PolicyConfig
     from jaxpomdp.structure.policy import revise as revise
     from jaxpomdp.structure.spec import FlatSpec as FlatSpec
     from jaxpomdp.structure.splits import SplitConfig as SplitConfig
     from jaxpomdp.structure.tree import TreeSpec as TreeSpec
+    from jaxpomdp.structure.tree_evidence import TreeEvidence as TreeEvidence
     from jaxpomdp.structure.tree_forms import flatten_tree as flatten_tree
     from jaxpomdp.structure.tree_forms import maximal as maximal
     from jaxpomdp.structure.tree_forms import minimal as minimal
     from jaxpomdp.structure.tree_forms import one_level as one_level
     from jaxpomdp.structure.tree_init import random_tree as random_tree
     from jaxpomdp.structure.tree_init import tree_over as tree_over
+    from jaxpomdp.structure.tree_tests import TreeSplitConfig as TreeSplitConfig
 
 __version__ = "0.1.0"
 
@@ -169,8 +174,12 @@ _HOMES = {
     "Schedule": "jaxpomdp.agents.control",
     "SplitConfig": "jaxpomdp.structure.splits",
     "Step": "jaxpomdp.envs.world",
+    "TREE_SPLITS": "jaxpomdp.structure.operators",
+    "TreeCapacity": "jaxpomdp.packing",
+    "TreeEvidence": "jaxpomdp.structure.tree_evidence",
     "TreeParams": "jaxpomdp.models.hierarchical",
     "TreeSpec": "jaxpomdp.structure.tree",
+    "TreeSplitConfig": "jaxpomdp.structure.tree_tests",
     "TrialBatch": "jaxpomdp._types",
     "TrueModel": "jaxpomdp.envs.world",
     "World": "jaxpomdp.envs.world",
@@ -187,6 +196,7 @@ _HOMES = {
     "fit_restarts": "jaxpomdp.models.selection",
     "flatten_tree": "jaxpomdp.structure.tree_forms",
     "from_pomdp": "jaxpomdp.envs.pomdp_world",
+    "gather_tree_evidence": "jaxpomdp.agents.tree_evidence",
     "hallway": "jaxpomdp.envs.hallway",
     "hallway_navigation": "jaxpomdp.envs.hallway",
     "heading_maze": "jaxpomdp.envs.maze89",

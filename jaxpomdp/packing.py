@@ -51,7 +51,9 @@ def room_for(specs: Sequence[TreeSpec], leaves: int) -> TreeCapacity:
 def pack(specs: Sequence[FlatSpec], capacity: int) -> FlatParams: ...
 @overload
 def pack(specs: Sequence[TreeSpec], capacity: int | TreeCapacity) -> TreeParams: ...
-def pack(specs: Sequence[Any], capacity: Any) -> FlatParams | TreeParams:
+def pack(
+    specs: Sequence[FlatSpec] | Sequence[TreeSpec], capacity: int | TreeCapacity
+) -> FlatParams | TreeParams:
     """Return the models as one pytree of arrays with leading ``[S]`` and ``capacity`` slots for states.
 
     The numbers keep their type where the device has it, so ``unpack(pack(specs, capacity), s) == specs[s]``.
@@ -63,6 +65,10 @@ def pack(specs: Sequence[Any], capacity: Any) -> FlatParams | TreeParams:
     _check_alike(specs)
     if isinstance(specs[0], TreeSpec):
         return _pack_trees(specs, room_for(specs, capacity) if isinstance(capacity, int) else capacity)
+    return _pack_flat(specs, capacity)
+
+
+def _pack_flat(specs: Sequence[Any], capacity: Any) -> FlatParams:
     slots, alive = slots_of([np.arange(spec.num_states) for spec in specs], capacity)
     emissions, returns = _padded_leaves(specs, slots)
     log_init = np.where(
@@ -219,15 +225,14 @@ def _spec_of(params: Any, s: int) -> Any:
         Channel(type(channel).__name__, {f.name: getattr(channel, f.name)[s][alive] for f in fields(channel)})
         for channel in params.emissions
     )
-    mean, var = params.returns.mean[s][alive], params.returns.var[s][alive]
+    leaves = (channels, params.returns.mean[s][alive], params.returns.var[s][alive])
     if isinstance(params, TreeParams):
         leaf_parent, node_parent, vertical, horizontal = _tree_of(params, s)
-        return TreeSpec(leaf_parent, node_parent, vertical, horizontal, channels, mean, var)
-    log_init, log_trans = params.log_init[s][alive], params.log_trans[s][:, alive][:, :, alive]
-    return FlatSpec(log_init, log_trans, channels, mean, var)
+        return TreeSpec(leaf_parent, node_parent, vertical, horizontal, *leaves)
+    return FlatSpec(params.log_init[s][alive], params.log_trans[s][:, alive][:, :, alive], *leaves)
 
 
-def _tree_of(params: TreeParams, s: int) -> tuple[Any, Any, Any, Any]:
+def _tree_of(params: Any, s: int) -> tuple[np.ndarray, ...]:
     """Return ``leaf_parent``, ``node_parent`` and the two tables of one model, without spare slots."""
     path, slots = params.path[s], params.path.shape[-2]
     alive = np.flatnonzero(params.alive[s])

@@ -103,17 +103,19 @@ def _choose(
     operators: Sequence[tuple[Operator, Any]],
     rng: np.random.Generator | None,
 ) -> list[tuple[Operator, Edit]]:
-    """Collect edits up to the budget, no two of one state, shrunk to the room that is left."""
+    """Collect edits up to the budget, no two of one state or branch, shrunk to the room that is left."""
     room, taken = policy.node_cap - spec.num_states, resting.copy()
+    edited = np.zeros(spec.num_states, bool)
     chosen: list[tuple[Operator, Edit]] = []
     for operator, config in operators:
         allowance = Allowance(room, policy.edits_per_phase - len(chosen), taken, rng)
         for edit in operator.propose(spec, evidence, config, allowance):
             fitting = operator.shrink(edit, room) if room > 0 else None
-            if fitting is not None:
+            touched = [] if fitting is None else [fitting.node, *fitting.copied]
+            if fitting is not None and not edited[touched].any():
                 chosen.append((operator, fitting))
                 room -= len(fitting.copied)
-                taken[fitting.node] = True
+                taken[touched], edited[touched] = True, True
     return chosen
 
 

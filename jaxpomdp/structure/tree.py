@@ -136,9 +136,9 @@ class TreeSpec:
         none = np.zeros((len(leaf_parent), 1))
         mean = frozen("return_mean", none if return_mean is None else return_mean)
         var = frozen("return_var", np.ones_like(mean) if return_var is None else return_var)
-        down, along = safe_log(frozen("vertical", vertical)), safe_log(frozen("horizontal", horizontal))
+        down, across = safe_log(frozen("vertical", vertical)), safe_log(frozen("horizontal", horizontal))
         channels = tuple(channel_of(c) for c in emissions)
-        spec = TreeSpec(leaf_parent, node_parent, down, along, channels, mean, var)
+        spec = TreeSpec(leaf_parent, node_parent, down, across, channels, mean, var)
         validate_tree(spec)
         return spec
 

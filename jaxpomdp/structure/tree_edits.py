@@ -142,7 +142,8 @@ def _read(spec: TreeSpec, copied: Copied) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _grown(spec: TreeSpec, copied: Copied, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
-    leaves, dtype = copied.leaf_origin, spec.log_vertical.dtype
+    dtype = spec.log_vertical.dtype
+    leaves = copied.leaf_origin
     return TreeSpec(
         copied.leaf_parent,
         copied.node_parent,

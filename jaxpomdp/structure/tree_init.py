@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -94,13 +95,15 @@ def tree_over(
     tables = a + 1 if vertical_by_action else 1
     m, dtype = n + internal, flat.log_trans.dtype
     blank = np.zeros((tables, internal, m)), np.zeros((a, m, m + 1))
-    shape = TreeSpec(*parents, *blank, flat.emissions, flat.return_mean, flat.return_var)
+    shape = TreeSpec(
+        parents[0], parents[1], blank[0], blank[1], flat.emissions, flat.return_mean, flat.return_var
+    )
     vertical = _random_rows(rng, allowed_vertical(shape), tables, concentration)
     horizontal = _random_rows(rng, allowed_horizontal(shape), a, concentration)
     if tables > 1:
         vertical[:-1, 0] = 0
-    down, along = safe_log(vertical).astype(dtype), safe_log(horizontal).astype(dtype)
-    return TreeSpec(*parents, down, along, flat.emissions, flat.return_mean, flat.return_var)
+    down, across = safe_log(vertical).astype(dtype), safe_log(horizontal).astype(dtype)
+    return replace(shape, log_vertical=down, log_horizontal=across)
 
 
 def random_shape(rng: np.random.Generator, states: int, levels: int, form: Form = "diverse") -> list[Any]:

@@ -1,0 +1,138 @@
+"""The tree's operators: the laws of edits, what they find when it is there, and that they keep quiet else."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.hierarchy.planted import KINDS, simulate, world
+from jaxpomdp.structure.edits import Allowance
+from jaxpomdp.structure.operators import TREE_SPLITS, propose
+from jaxpomdp.structure.policy import PolicyConfig, revise
+from jaxpomdp.structure.tree import validate_tree
+from jaxpomdp.structure.tree_forms import maximal
+from jaxpomdp.structure.tree_tests import TreeSplitConfig, activations, brothers, uncles
+from tests.structure.trees import make_tree, thesis_tree
+
+OPERATORS = {operator.kind: operator for operator, _ in TREE_SPLITS}
+
+
+def eager(seed: int, kind: str):
+    """Edits found in planted data by tests that ask for little."""
+    spec = world(seed)
+    evidence = simulate(spec, seed, 3000, kind, leaf=seed % 9, shift=3.0)
+    return spec, propose(kind, spec, evidence, TreeSplitConfig(significance=0.5, correction="none"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_edits_keep_the_laws(kind: str) -> None:
+    """Rows stay stochastic, the origin is onto and of the right length, the log row is JSON."""
+    made = 0
+    for seed in range(6):
+        spec, edits = eager(seed, kind)
+        for edit in edits:
+            grown = OPERATORS[kind].apply(spec, edit)
+            validate_tree(grown)
+            assert len(edit.origin) == grown.num_states
+            assert set(edit.origin.tolist()) == set(range(spec.num_states))
+            assert grown.leaf_parent[: spec.num_states].tolist() == spec.leaf_parent.tolist()
+            assert json.loads(json.dumps(edit.row()))["operator"] == kind
+            assert OPERATORS[kind].shrink(edit, len(edit.copied) - 1) is None
+            made += 1
+    assert made > 5
+
+
+def test_each_operator_grows_what_it_should() -> None:
+    for kind, leaves, internal, deeper in (
+        ("observation", 1, 0, 0),
+        ("brother", 1, 0, 0),
+        ("uncle", 3, 1, 0),
+        ("parent", 3, 1, 1),
+    ):
+        spec, edits = next((s, e) for s, e in (eager(seed, kind) for seed in range(20)) if e)
+        grown = OPERATORS[kind].apply(spec, edits[0])
+        sizes = grown.num_states - 9, grown.num_internal - 4, grown.depth.max() - 2
+        assert sizes == (leaves, internal, deeper), kind
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_planted_inconsistency_is_found_where_it_is(kind: str) -> None:
+    spec = world(3)
+    hits = []
+    for leaf in range(9):
+        edits = propose(kind, spec, simulate(spec, leaf, 20_000, kind, leaf, shift=3.0))
+        hits.append(bool(edits) and edits[0].node == leaf)
+    assert sum(hits) >= (3 if kind == "parent" else 6), hits
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_planted_nothing_found(kind: str) -> None:
+    """At a level of 5 %, corrected: at most 5 of 30 by more than a slip (chance of more: under 1 %)."""
+    config = TreeSplitConfig(significance=0.05)
+    fired = 0
+    for seed in range(30):
+        spec = world(seed)
+        fired += bool(propose(kind, spec, simulate(spec, seed, 2000), config))
+    assert fired <= 5
+
+
+def test_conditions_are_sets_of_previous_leaves() -> None:
+    spec = thesis_tree()
+    by_brother, by_uncle = brothers(spec, 0), uncles(spec, 0)
+    assert by_brother.nodes.tolist() == [0, 1, -1]
+    assert by_brother.groups.sum(0).tolist() == [1] * 5
+    assert by_uncle.nodes.tolist() == [4, 7]
+    assert by_uncle.groups.astype(int).tolist() == [[0, 0, 0, 0, 1], [0, 0, 1, 1, 0]]
+    assert len(uncles(spec, 4).nodes) == 0
+
+
+def test_activations_split_ways_by_what_they_are_made_of() -> None:
+    """From each brother, starting over takes end x self x entry of the minimal transition."""
+    spec = make_tree(0, 9, 2)
+    most, leaf = maximal(spec), 0
+    parent = spec.parent[leaf]
+    if parent == spec.root:
+        leaf = int(np.flatnonzero(spec.parent[: spec.num_states] != spec.root)[0])
+        parent = spec.parent[leaf]
+    transitions = np.zeros((2, 9, 9))
+    transitions[1, :, leaf] = 1
+    own, other = activations(spec, most, leaf, transitions).groups
+    for k in range(9):
+        if not spec.below[parent, k]:
+            assert (own[k], other[k]) == (0, 1)
+            continue
+        ends = np.exp(most.log_horizontal[1, k, -1] + most.log_horizontal[1, parent, parent])
+        over = ends * np.exp(spec.log_vertical[-1, parent - spec.root, leaf])
+        assert own[k] == pytest.approx(over / np.exp(spec.log_horizontal[1, k, leaf]))
+        assert other[k] == 0
+
+
+def test_a_phase_of_edits_holds_the_cap_and_composes() -> None:
+    """All four operators at once, many edits: no two of one branch, and an origin that is onto."""
+    config = TreeSplitConfig(significance=0.9, correction="none", minimum_weight=5)
+    operators = [(operator, config) for operator, _ in TREE_SPLITS]
+    for seed in range(5):
+        spec = world(seed)
+        evidence = simulate(spec, seed, 3000, "uncle", 0, shift=3.0)
+        policy = PolicyConfig(node_cap=16, edits_per_phase=5, cool_down=2)
+        revision = revise(spec, evidence, phase=0, policy=policy, operators=operators)
+        validate_tree(revision.spec)
+        assert len(revision.rows) > 1
+        assert revision.spec.num_states == len(revision.origin) <= 16
+        assert set(revision.origin.tolist()) == set(range(9))
+
+
+def test_allowances_and_wrong_arguments() -> None:
+    spec, edits = eager(0, "uncle")
+    evidence = simulate(spec, 0, 3000, "uncle", 0, shift=3.0)
+    assert propose("uncle", spec, evidence, allowance=Allowance(room=0)) == []
+    assert propose("uncle", spec, evidence, allowance=Allowance(room=2)) == []
+    assert propose("uncle", spec, evidence, allowance=Allowance(resting=np.ones(9, bool))) == []
+    with pytest.raises(ValueError, match=r"evidence.transitions must have shape \(2, 5, 5\)|\(1, 5, 5\)"):
+        propose("uncle", thesis_tree(), evidence)
+    with pytest.raises(ValueError, match="edit must be for 5 leaves, got 9"):
+        OPERATORS["uncle"].apply(thesis_tree(), edits[0])
+    with pytest.raises(ValueError, match="strong must be between 0 and 1"):
+        TreeSplitConfig(strong=1.5)
