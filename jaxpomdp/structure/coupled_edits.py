@@ -149,11 +149,7 @@ def apply_coupled(spec: CoupledSpec, edit: Edit) -> CoupledSpec:
     Raises:
         ValueError: the edit is for another number of states, or of another kind.
     """
-    if edit.kind != KIND or edit.num_states != spec.num_states:
-        raise ValueError(
-            f"edit must be of kind {KIND!r} for {spec.num_states} states, "
-            f"got {edit.kind!r} for {edit.num_states} (see Edit.moved)"
-        )
+    edit.stop_unless(KIND, spec.num_states)
     done: CoupledSplit = edit.details
     shares = split_shares(spec.num_actions, spec.num_states, done.split)
     rng = np.random.default_rng((done.split.seed, 1))

@@ -52,6 +52,18 @@ class Edit:
         """Return the edit for a spec that has grown to ``num_states`` since it was proposed."""
         return replace(self, num_states=num_states)
 
+    def stop_unless(self, kind: str, num_states: int) -> None:
+        """Stop unless this is an edit of ``kind`` for a spec of ``num_states``.
+
+        Raises:
+            ValueError: it is for another number of states, or of another kind.
+        """
+        if self.kind != kind or self.num_states != num_states:
+            raise ValueError(
+                f"edit must be of kind {kind!r} for {num_states} states, "
+                f"got {self.kind!r} for {self.num_states} (see Edit.moved)"
+            )
+
     def row(self) -> dict[str, Any]:
         """Return the edit as a JSON-friendly row for the log."""
         row = {"operator": self.kind, "node": self.node, "copied": list(self.copied), "score": self.score}

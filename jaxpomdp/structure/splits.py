@@ -203,11 +203,7 @@ def apply_split(spec: FlatSpec, edit: Edit) -> FlatSpec:
     Raises:
         ValueError: the edit is for another number of states, or of another kind.
     """
-    if edit.kind != KIND or edit.num_states != spec.num_states:
-        raise ValueError(
-            f"edit must be of kind {KIND!r} for {spec.num_states} states, "
-            f"got {edit.kind!r} for {edit.num_states} (see Edit.moved)"
-        )
+    edit.stop_unless(KIND, spec.num_states)
     split: StateSplit = edit.details
     cloned = clone_state(spec, edit.node, split_shares(spec.num_actions, spec.num_states, split))
     copies = np.flatnonzero(edit.origin == edit.node)

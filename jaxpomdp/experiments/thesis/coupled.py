@@ -8,9 +8,8 @@ from pathlib import Path
 
 from jaxpomdp.experiments.config import RunConfig
 from jaxpomdp.experiments.experiment import Experiment, Measured, Row
-from jaxpomdp.experiments.plots import Bars, bars
 from jaxpomdp.experiments.thesis import fig_3_7, hallway, maze89
-from jaxpomdp.experiments.thesis.one_theta import NEARLY_SOLVED
+from jaxpomdp.experiments.thesis.worlds import plot_held
 
 VARIANTS = (
     ("product", "exact"),
@@ -24,7 +23,7 @@ TARGETS = {"successes_held": 14}
 WORLDS = {
     "hallway": (hallway.run(0.2), "cudhmm", hallway.CRITERION),
     "T-maze, N = 10": (fig_3_7.run(10, 0.2), "cudhmm-tmaze", fig_3_7.CRITERION),
-    "89-state maze": (maze89.run("udhmm", 2000, theta=0.2), "cudhmm-maze89", NEARLY_SOLVED),
+    "89-state maze": (maze89.run("udhmm", 2000, theta=0.2), "cudhmm-maze89", maze89.CRITERION),
 }
 """A run of the flat agent, the coupled agent for it, and when a run is a success."""
 
@@ -49,11 +48,8 @@ def _rows(world: str) -> list[Row]:
 def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
     """Draw the runs that held in every world, a group of bars for each variant."""
     names = ["flat", *(", ".join(variant) for variant in VARIANTS)]
-    held = [m.metrics["successes_held"] for m in measured]
-    groups = [Bars(name, held[i :: len(names)]) for i, name in enumerate(names)]
-    top = measured[0].per_seed["success_held"].size
-    labels = {"xlabel": "world", "ylabel": "runs that held"}
-    return bars(groups, list(WORLDS), path, title=experiment.title, top=top, **labels)
+    variants = {name: measured[i :: len(names)] for i, name in enumerate(names)}
+    return plot_held(experiment, variants, list(WORLDS), path)
 
 
 EXPERIMENT = Experiment(

@@ -8,10 +8,13 @@ from pathlib import Path
 from jaxpomdp.experiments.config import RunConfig
 from jaxpomdp.experiments.experiment import Experiment, Measured
 from jaxpomdp.experiments.plots import Curve, Line, learning_curves
+from jaxpomdp.experiments.results import Criterion
 from jaxpomdp.experiments.stats import median_run
 
 SOURCE = "thesis, Table 3.1 and section 3.5.3"
 TRIALS = 6000
+CRITERION = Criterion("goal_percent", 92.0, last=2)
+"""As good as the thesis's UDHMM, at the last two evaluations."""
 
 
 def run(agent: str, trials: int = TRIALS, **settings: float) -> RunConfig:

@@ -8,13 +8,10 @@ from pathlib import Path
 
 from jaxpomdp.experiments.config import RunConfig
 from jaxpomdp.experiments.experiment import Experiment, Measured, Row
-from jaxpomdp.experiments.plots import Bars, bars
-from jaxpomdp.experiments.results import Criterion
 from jaxpomdp.experiments.thesis import fig_3_7, hallway, maze89
+from jaxpomdp.experiments.thesis.worlds import plot_held
 
 THETAS = (0.0, 0.02, 0.2)
-NEARLY_SOLVED = Criterion("goal_percent", 92.0, last=2)
-"""In the 89-state maze: as good as the thesis's UDHMM."""
 
 
 def _by_action(config: RunConfig) -> RunConfig:
@@ -27,7 +24,7 @@ def _rows(theta: float) -> list[Row]:
         "hallway": (hallway.run(theta), hallway.CRITERION),
         "hallway with noise": (hallway.noisy_run(theta), hallway.CRITERION),
         "T-maze, N = 10": (fig_3_7.run(10, theta), fig_3_7.CRITERION),
-        "89-state maze": (maze, NEARLY_SOLVED),
+        "89-state maze": (maze, maze89.CRITERION),
     }
     return [
         Row(f"{world}, θ = {theta:g}", _by_action(run), criterion=criterion)
@@ -38,12 +35,9 @@ def _rows(theta: float) -> list[Row]:
 def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
     """Draw the runs that held in every world, a group of bars for each theta."""
     worlds = [m.row.name.split(", θ")[0] for m in measured[: len(measured) // len(THETAS)]]
-    held = [m.metrics["successes_held"] for m in measured]
-    columns = [held[i * len(worlds) :][: len(worlds)] for i in range(len(THETAS))]
-    groups = [Bars(f"θ = {theta:g}", column) for theta, column in zip(THETAS, columns, strict=True)]
-    top = measured[0].per_seed["success_held"].size
-    labels = {"xlabel": "world", "ylabel": "runs that held"}
-    return bars(groups, worlds, path, title=experiment.title, top=top, **labels)
+    rows = [measured[i * len(worlds) :][: len(worlds)] for i in range(len(THETAS))]
+    variants = {f"θ = {theta:g}": row for theta, row in zip(THETAS, rows, strict=True)}
+    return plot_held(experiment, variants, worlds, path)
 
 
 EXPERIMENT = Experiment(

@@ -1,0 +1,19 @@
+"""What the experiments that go through several worlds share: one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from jaxpomdp.experiments.experiment import Experiment, Measured
+from jaxpomdp.experiments.plots import Bars, bars
+
+
+def plot_held(
+    experiment: Experiment, variants: Mapping[str, Sequence[Measured]], worlds: Sequence[str], path: Path
+) -> Path:
+    """Draw the runs that held in every world, a group of bars for each variant (its rows world by world)."""
+    groups = [Bars(name, [m.metrics["successes_held"] for m in rows]) for name, rows in variants.items()]
+    top = next(iter(variants.values()))[0].per_seed["success_held"].size
+    labels = {"xlabel": "world", "ylabel": "runs that held"}
+    return bars(groups, worlds, path, title=experiment.title, top=top, **labels)
