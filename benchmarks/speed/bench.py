@@ -14,6 +14,7 @@ import platform
 import resource
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -85,10 +86,10 @@ def accuracy(name: str) -> dict[str, float]:
     }
 
 
-def measure(parts: list[str], rounds: int, budget: float) -> dict[str, Any]:
-    """Return everything that was asked for."""
+def measure(parts: list[str], rounds: int, budget: float) -> Iterator[dict[str, Any]]:
+    """Yield each part that was asked for once it is measured, so that a run cut short keeps the rest."""
     limit = limits()
-    result: dict[str, Any] = {"limits": limit}
+    yield {"limits": limit}
     for part in parts:
         print(f"{part} ...", file=sys.stderr, flush=True)
         if part in LOADS:
@@ -96,14 +97,13 @@ def measure(parts: list[str], rounds: int, budget: float) -> dict[str, Any]:
             for who, row in found["contestants"].items():
                 row["peak_mebibytes"] = child(f"memory {part} {who}").get("mebibytes")
             found["float32_error"] = accuracy(part)
-            result[part] = found
         elif part == "W5":
-            result[part] = acting.compare(rounds)
+            found = acting.compare(rounds)
         elif part == "W6":
-            result[part] = training.compare()
+            found = training.compare()
         else:
-            result[part] = inference.growth(max(rounds // 2, 1))
-    return result
+            found = inference.growth(max(rounds // 2, 1))
+        yield {part: found}
 
 
 def show(result: dict[str, Any]) -> None:
@@ -135,18 +135,18 @@ def main() -> None:
         print(json.dumps(peak_memory(name, who) if kind == "memory" else totals(name, who)))
         return
     path = options.out / "speed.json"
-    old = json.loads(path.read_text()) if path.exists() else {}
-    found = measure(options.only, options.rounds, options.budget)
-    about = {
+    result = json.loads(path.read_text()) if path.exists() else {}
+    result |= {
         "name": "speed",
         "command": "python benchmarks/speed/bench.py",
         "machine": machine(),
         "versions": versions(),
     }
-    result = {**old, **about, **found}
     options.out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=1) + "\n")
-    show(found)
+    for found in measure(options.only, options.rounds, options.budget):
+        result |= found
+        path.write_text(json.dumps(result, indent=1) + "\n")
+        show(found)
     from figures import draw
 
     draw(result, options.out / "speed.png")
