@@ -167,11 +167,15 @@ class Agent:
             params, found = refit(params, batch, jnp.asarray(held), iterations=settings.em_iterations)
             evidence = np.asarray(found)
         clock.lap("fitting")
+        edits = len(self.log)
         state, grew = self._split(state._replace(params=params), batch, tapes.trial, held)
         clock.lap("structure")
         if grew.any() and settings.split_iterations:
-            params, _ = refit(state.params, batch, jnp.asarray(~grew), iterations=settings.split_iterations)
+            params, found = refit(
+                state.params, batch, jnp.asarray(~grew), iterations=settings.split_iterations
+            )
             state = state._replace(params=params)
+            _note_evidence(self.log[edits:], evidence, np.asarray(found))
         clock.lap("fitting", after=state.params)
         return self._replay(state, batch, clock), evidence
 
@@ -296,6 +300,13 @@ class Agent:
         kept = (state.best.params, state.best.q)
         params, q = keeping.select(worse, kept, (state.params, state.actor.q))
         return state._replace(params=params, actor=replace(state.actor, q=q))
+
+
+def _note_evidence(edits: list[dict[str, Any]], before: np.ndarray, after: np.ndarray) -> None:
+    """Add to each edit's row the log-evidence of its seed's window before the phase's edits and after."""
+    for row in edits:
+        s = row["seed_index"]
+        row |= {"log_evidence_before": float(before[s]), "log_evidence_after": float(after[s])}
 
 
 def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.ndarray]:

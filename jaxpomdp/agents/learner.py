@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpomdp._types import Array, TrialBatch
+from jaxpomdp._types import Array, Chain, TrialBatch
 from jaxpomdp.agents.best import select
 from jaxpomdp.agents.control import ControlConfig
-from jaxpomdp.agents.trial import memory_of
 from jaxpomdp.kernels import native
 from jaxpomdp.kernels.control import ReplayData, replay_tape
 from jaxpomdp.kernels.filtering import filter_tape
@@ -234,11 +233,14 @@ def replay(
 
 def filter_batch(family: Family, params: Any, batch: TrialBatch) -> Array:
     """Return what an agent with these models would have believed at every step, ``[S, B, T, N]``."""
-    memory = jax.vmap(partial(memory_of, family))(params)
     log_obs = jax.vmap(family.log_obs)(params, batch.observations, batch.observed)
+    return filter_chains(jax.vmap(family.acting)(params), log_obs, batch)
+
+
+def filter_chains(chains: Chain, log_obs: Array, batch: TrialBatch) -> Array:
+    """Return the filtered beliefs of ``S`` chains on their tapes ``[S, B, T, N]``, the fastest way here."""
     if native.available() and log_obs.dtype == jnp.float32:
-        arguments = (memory.init, memory.trans, log_obs, batch.actions, batch.start, batch.valid)
-        return native.filter_tapes(*arguments)[0]
-    chains = jax.vmap(family.acting)(params)
+        tables = jnp.exp(chains.log_init), jnp.exp(chains.log_trans)
+        return native.filter_tapes(*tables, log_obs, batch.actions, batch.start, batch.valid)[0]
     over_tapes = jax.vmap(lambda *tape: filter_tape(*tape).belief, in_axes=(None, 0, 0, 0, 0))
     return jax.vmap(over_tapes)(chains, log_obs, batch.actions, batch.start, batch.valid)

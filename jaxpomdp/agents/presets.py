@@ -11,9 +11,11 @@ from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.coupled_kind import CoupledModel
 from jaxpomdp.agents.learner import LearnerConfig
 from jaxpomdp.agents.settings import with_settings
+from jaxpomdp.agents.tree_kind import HierarchicalModel
 from jaxpomdp.envs.world import World
 from jaxpomdp.structure.policy import PolicyConfig
 from jaxpomdp.structure.splits import SplitConfig
+from jaxpomdp.structure.tree_tests import TreeSplitConfig
 
 UDHMM = AgentConfig(
     ControlConfig(alpha=0.03, gamma=0.95, lam=0.95, schedule=Schedule(0.2, 0.0, 250_000)),
@@ -104,7 +106,30 @@ def coupled(base: AgentConfig, *, node_cap: int, **settings: Any) -> AgentConfig
 CUDHMM = coupled(HALLWAY, node_cap=30, return_cap=8)
 """The coupled agent in the hallway."""
 
+HUDHMM = replace(
+    UDHMM,
+    learner=replace(
+        UDHMM.learner,
+        states=20,
+        theta=0.2,
+        policy=PolicyConfig(node_cap=100, edits_per_phase=2, order="rotate"),
+    ),
+    model=HierarchicalModel(),
+)
+"""The hierarchical agent with its operators in the 89-state maze (thesis 6.4.2)."""
+
+HUDHMM_TMAZE = replace(
+    TMAZE,
+    learner=replace(
+        TMAZE.learner, states=20, policy=PolicyConfig(node_cap=60, edits_per_phase=2, order="rotate")
+    ),
+    model=HierarchicalModel(tests=TreeSplitConfig(stay=0.9)),
+)
+"""The hierarchical agent in the T-maze (thesis 6.4.1)."""
+
 LEARNERS: Mapping[str, AgentConfig] = {
+    "hudhmm": HUDHMM,
+    "hudhmm-tmaze": HUDHMM_TMAZE,
     "cudhmm": CUDHMM,
     "cudhmm-mixture": coupled(HALLWAY, node_cap=30, return_cap=8, coupling="mixture", added="components"),
     "cudhmm-maze89": coupled(UDHMM, node_cap=50, return_cap=8),

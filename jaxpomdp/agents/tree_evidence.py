@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxpomdp._types import Array, Chain, TrialBatch
-from jaxpomdp.kernels.filtering import filter_tape, linked_steps
+from jaxpomdp._types import Array, TrialBatch
+from jaxpomdp.agents.learner import filter_chains
+from jaxpomdp.kernels.filtering import EXACT, linked_steps
 from jaxpomdp.models.em import EMConfig, e_step
 from jaxpomdp.models.family import Family
 from jaxpomdp.structure.tree_evidence import TreeEvidence
@@ -50,42 +51,42 @@ def gather_tree_evidence(
     """
     chains, log_obs = jax.vmap(partial(family.learning, theta=config.theta))(params, batch)
     smoothed = e_step(family, params, batch, config)
+    belief = filter_chains(chains, log_obs, batch)
     over = partial(_of_model, num_symbols=num_symbols, bins=bins)
-    found = jax.vmap(over)(chains, log_obs, smoothed.gamma, batch, symbols)
-    return TreeEvidence(smoothed.xi, *found)
+    models = (jnp.exp(chains.log_trans), belief, smoothed.gamma, batch, symbols)
+    return TreeEvidence(smoothed.xi, *jax.lax.map(lambda model: over(*model), models))
 
 
 def _of_model(
-    chain: Chain,
-    log_obs: Array,
+    trans: Array,
+    belief: Array,
     gamma: Array,
     batch: TrialBatch,
     symbols: Array,
     num_symbols: int,
     bins: int,
 ) -> tuple[Array, ...]:
-    forward = jax.vmap(partial(filter_tape, chain))
-    filtered = forward(log_obs, batch.actions, batch.start, batch.valid)
     linked = jax.vmap(linked_steps)(batch.start, batch.valid)
-    some = filtered.predicted > 0
-    ratio = jnp.where(some, gamma / jnp.where(some, filtered.predicted, 1), 0)
     counted = batch.has_return & batch.valid
     edges = _edges(batch.returns, counted, bins)
-    actions = chain.log_trans.shape[0]
+    actions = trans.shape[0]
     place = jnp.clip(jnp.searchsorted(edges, batch.returns, side="right") - 1, 0, bins - 1)
     cells = _Cells(
         jnp.where(batch.observed & batch.valid, symbols, -1),
         jnp.where(counted, batch.actions * bins + place, -1),
         jnp.where(counted, batch.returns, 0),
     )
-    before = jnp.where(linked[..., None], filtered.belief, 0)
-    seen, outcomes, sums = _sums(
-        jnp.exp(chain.log_trans), before, ratio, batch.actions, cells, num_symbols, actions * bins, bins
-    )
+    before = jnp.where(linked[..., None], belief, 0)
+    steps = _Steps(trans, *(_rows(x) for x in (_shifted(before), gamma, _shifted(batch.actions))))
+    symbol, outcome, value = (_rows(x) for x in cells)
+    one = jnp.ones_like(value)
+    seen = sums_by_cell(steps, symbol, one[:, None], num_symbols)[0]
+    powers = jnp.stack([one, value, value**2], axis=-1)
+    outcomes = sums_by_cell(steps, outcome, powers, actions * bins)
     n = gamma.shape[-1]
-    returns = jnp.moveaxis(outcomes, 0, -1).reshape(n, n, actions, bins)
-    moments = jnp.moveaxis(sums.reshape(actions, 2, n, n), (2, 3), (0, 1))
-    return jnp.moveaxis(seen, 0, -1), returns, moments, edges
+    tables = jnp.moveaxis(outcomes, (2, 3), (0, 1)).reshape(n, n, 3, actions, bins)
+    moments = jnp.moveaxis(jnp.sum(tables[:, :, 1:], axis=-1), 2, -1)
+    return jnp.moveaxis(seen, 0, -1), tables[:, :, 0], moments, edges
 
 
 def _edges(returns: Array, counted: Array, bins: int) -> Array:
@@ -96,40 +97,77 @@ def _edges(returns: Array, counted: Array, bins: int) -> Array:
     return low + (jnp.maximum(high - low, 1e-6)) * jnp.linspace(0, 1, bins + 1, dtype=returns.dtype)
 
 
-def _sums(
-    trans: Array,
-    before: Array,
-    ratio: Array,
-    actions: Array,
-    cells: _Cells,
-    num_symbols: int,
-    num_outcomes: int,
-    bins: int,
-) -> tuple[Array, ...]:
-    """Add up ``xi_t`` by cell in one pass over all tapes laid end to end: ``[cells, N, N]`` each."""
+class _Steps(NamedTuple):
+    """All steps of a model's tapes laid end to end: ``trans[A, N, N]``, the belief one step before
+    ``before[P, N]`` (zero at starts), smoothed ``now[P, N]``, and the action in between ``action[P]``.
+    """
 
-    def rows(x: Array, shift: int = 0) -> Array:
-        moved = jnp.roll(x, shift, axis=1) if shift else x
-        return moved.reshape(-1, *x.shape[2:])
+    trans: Array
+    before: Array
+    now: Array
+    action: Array
 
-    def step(carry: tuple[Array, ...], inputs: tuple[Any, ...]) -> tuple[tuple[Array, ...], None]:
-        seen, outcomes, sums = carry
-        belief, action, weight, (symbol, outcome, value) = inputs
-        pair = belief[:, None] * trans[action] * weight[None]
-        column = jnp.where(outcome >= 0, outcome // bins, num_outcomes)
-        seen = seen.at[jnp.where(symbol >= 0, symbol, num_symbols)].add(pair, mode="drop")
-        outcomes = outcomes.at[jnp.where(outcome >= 0, outcome, num_outcomes)].add(pair, mode="drop")
-        powers = jnp.stack([value * pair, value**2 * pair])
-        return (seen, outcomes, sums.at[column].add(powers, mode="drop")), None
 
-    n, dtype = trans.shape[-1], trans.dtype
-    blank = (
-        jnp.zeros((num_symbols, n, n), dtype),
-        jnp.zeros((num_outcomes, n, n), dtype),
-        jnp.zeros((num_outcomes // bins, 2, n, n), dtype),
-    )
-    inputs = (rows(before, 1), rows(actions, 1), rows(ratio), jax.tree.map(rows, cells))
-    return jax.lax.scan(step, blank, inputs)[0]
+BLOCK = 32
+"""Steps of one cell and action that are added up by one product."""
+
+
+def sums_by_cell(steps: _Steps, cell: Array, weights: Array, cells: int) -> Array:
+    """Return ``sum_t w_t[k] xi_t(i, j)`` over the steps of each cell, ``[K, cells, N, N]``.
+
+    Steps are sorted by cell and action and cut into blocks, so that a block costs one matrix product.
+
+    Args:
+        steps: what happened.
+        cell: int ``[P]``, -1 where a step counts nowhere.
+        weights: ``[P, K]``.
+        cells: how many there are.
+    """
+    actions, n = steps.trans.shape[:2]
+    groups = cells * actions
+    group = jnp.where(cell >= 0, cell * actions + steps.action, groups)
+    slots, group_of_block = _blocks(group, groups)
+    before, now = (jnp.pad(x, ((0, 1), (0, 0)))[slots] for x in (steps.before, steps.now))
+    powers = jnp.pad(weights, ((0, 1), (0, 0)))[slots]
+
+    def add(total: Array, block: tuple[Array, ...]) -> tuple[Array, None]:
+        left, right, power, number = block
+        place, action = jnp.divmod(number, actions)
+        matrix = steps.trans[action]
+        predicted = jnp.matmul(left, matrix, precision=EXACT)
+        ratio = jnp.where(predicted > 0, right / jnp.where(predicted > 0, predicted, 1), 0)
+        pairs = jnp.einsum("bk,bi,bj->kij", power, left, ratio, precision=EXACT)
+        return total.at[place].add(pairs * matrix[None], mode="drop"), None
+
+    blank = jnp.zeros((cells, weights.shape[-1], n, n), steps.trans.dtype)
+    total = jax.lax.scan(add, blank, (before, now, powers, group_of_block))[0]
+    return jnp.moveaxis(total, 1, 0)
+
+
+def _blocks(group: Array, groups: int) -> tuple[Array, Array]:
+    """Return which step fills each slot ``[blocks, BLOCK]`` (P: none), and the group of each block.
+
+    Steps of group ``groups`` and blocks that are not needed are left out (their group is ``groups``).
+    """
+    size = group.shape[0]
+    blocks = size // BLOCK + groups
+    order = jnp.argsort(group)
+    count = jnp.bincount(group, length=groups + 1)
+    needed = -(-count[:groups] // BLOCK)
+    end = jnp.cumsum(needed)
+    begin = jnp.append(end - needed, blocks)
+    rank = jnp.arange(size) - (jnp.cumsum(count) - count)[group[order]]
+    place = begin[group[order]] * BLOCK + rank
+    slots = jnp.full(blocks * BLOCK, size).at[place].set(order, mode="drop")
+    return slots.reshape(blocks, BLOCK), jnp.searchsorted(end, jnp.arange(blocks), side="right")
+
+
+def _shifted(x: Array) -> Array:
+    return jnp.roll(x, 1, axis=1)
+
+
+def _rows(x: Array) -> Array:
+    return x.reshape(-1, *x.shape[2:])
 
 
 def evidence_of_model(evidence: TreeEvidence, s: int, num_states: int) -> TreeEvidence:

@@ -35,6 +35,7 @@ class TreeSplit(NamedTuple):
         symbols: ``[2, O]``, observations of the leaf and its copy; None: copied.
         returns: ``[2, 2]``, mean and variance of the return of the leaf and its copy; None: copied.
         strong: share of the new level.
+        stay: share of a leaf's transition to itself that each of the two keeps; None: shared like the rest.
     """
 
     conditions: tuple[str, str]
@@ -46,6 +47,7 @@ class TreeSplit(NamedTuple):
     symbols: np.ndarray | None
     returns: np.ndarray | None
     strong: float
+    stay: float | None
 
     def row(self) -> dict[str, Any]:
         """Return the JSON-friendly part of the log row."""
@@ -104,7 +106,7 @@ def apply(spec: TreeSpec, edit: Edit) -> TreeSpec:
         )
     if edit.kind == "parent":
         return new_level(spec, top, split.strong)
-    grown = clone_branch(spec, top, _shares(spec, split))
+    grown = clone_branch(spec, top, _shares(spec, split), split.stay)
     twin = spec.num_states + int(np.flatnonzero(branch_leaves(spec, top) == edit.node)[0])
     return _told_apart(grown, split, (edit.node, twin))
 
@@ -162,6 +164,7 @@ def _split(
         symbols,
         returns,
         config.strong,
+        config.stay,
     )
 
 
@@ -259,6 +262,7 @@ UNCLE_SPLIT = _operator("uncle")
 PARENT_SPLIT = _operator("parent")
 """Where a leaf's return depends on who activated its parent, a level is added below the parent (6.3.4)."""
 
-_OPERATORS = (OBSERVATION_SPLIT, BROTHER_SPLIT, UNCLE_SPLIT, PARENT_SPLIT)
-TREE_SPLITS = tuple((operator, DEFAULTS) for operator in _OPERATORS)
-"""The tree's operators at their defaults; the cousin split's place is last."""
+TREE_OPERATORS = {o.kind: o for o in (OBSERVATION_SPLIT, BROTHER_SPLIT, UNCLE_SPLIT, PARENT_SPLIT)}
+"""The tree's operators by name, in their order; the cousin split's place is last."""
+TREE_SPLITS = tuple((operator, DEFAULTS) for operator in TREE_OPERATORS.values())
+"""The tree's operators at their defaults."""

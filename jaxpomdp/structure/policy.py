@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -30,9 +30,13 @@ class PolicyConfig:
     """phases before this one edit nothing"""
     cool_down: int = 0
     """phases for which a state that was edited (and its copies) is left alone"""
+    order: Literal["given", "rotate"] = "given"
+    """which operator has the first say: always the first, or each in turn, phase by phase"""
 
     def __post_init__(self) -> None:
         """Refuse settings out of range."""
+        if self.order not in ("given", "rotate"):
+            raise ValueError(f"order must be 'given' or 'rotate', got {self.order!r}")
         least = {"node_cap": 1, "edits_per_phase": 0, "every": 1, "first_phase": 0, "cool_down": 0}
         for name, number in least.items():
             if getattr(self, name) < number:
@@ -91,8 +95,17 @@ def revise(
     fewer = np.maximum(waiting - 1, 0)
     if phase < policy.first_phase or (phase - policy.first_phase) % policy.every:
         return Revision(spec, np.arange(spec.num_states), fewer, [])
-    chosen = _choose(spec, evidence, waiting > 0, policy, operators, rng)
+    chosen = _choose(spec, evidence, waiting > 0, policy, _in_turn(operators, policy, phase), rng)
     return _apply_all(spec, chosen, fewer, policy, phase)
+
+
+def _in_turn(
+    operators: Sequence[tuple[Operator, Any]], policy: PolicyConfig, phase: int
+) -> list[tuple[Operator, Any]]:
+    """Return the operators, the one whose turn it is first."""
+    turn = (phase - policy.first_phase) // policy.every if policy.order == "rotate" else 0
+    first = turn % max(len(operators), 1)
+    return [*operators[first:], *operators[:first]]
 
 
 def _choose(

@@ -30,7 +30,7 @@ def branch_leaves(spec: TreeSpec, node: int) -> np.ndarray:
     return np.flatnonzero(spec.below[node])
 
 
-def clone_branch(spec: TreeSpec, node: int, shares: np.ndarray) -> TreeSpec:
+def clone_branch(spec: TreeSpec, node: int, shares: np.ndarray, stay: float | None = None) -> TreeSpec:
     """Copy a branch (or a leaf) as a sibling of itself; the two share what leads there.
 
     Args:
@@ -38,6 +38,7 @@ def clone_branch(spec: TreeSpec, node: int, shares: np.ndarray) -> TreeSpec:
         node: the top of the branch, not the root.
         shares: ``[M+1]``: what share of the transition from each sibling to the node goes to the copy, at the
             end of its entry from the parent; at the node itself, of a leaf's transition to itself.
+        stay: how much of a leaf's transition to itself each of the two keeps, instead of sharing it.
 
     Raises:
         ValueError: the node is the root, or shares are not between 0 and 1.
@@ -49,7 +50,9 @@ def clone_branch(spec: TreeSpec, node: int, shares: np.ndarray) -> TreeSpec:
     copied = _copied(spec, np.array([node]), spec.parent[node] - spec.root)
     top, twin = _twins(spec, copied, node)
     vertical, horizontal, origin = _read(spec, copied)
-    from_rows = shares[origin][None]
+    from_rows = shares[origin][None].copy()
+    if stay is not None and node < spec.num_states:
+        from_rows[:, [top, twin]] = 1 - stay, stay
     horizontal[:, :, twin] *= from_rows
     horizontal[:, :, top] *= 1 - from_rows
     vertical[:, :, twin] *= shares[-1]

@@ -36,6 +36,8 @@ class TreeSplitConfig:
     """least Cramer's V, whatever the weight"""
     strong: float = 0.95
     """share of the connection that fits; the other copy gets the rest (thesis 6.3.1)"""
+    stay: float | None = None
+    """share of a leaf's transition to itself that a copy keeps (sticky: 0.9); None: shared like the rest"""
     pseudo: float = 0.5
     """pseudo-count per symbol in the observations of a new copy"""
     most_levels: int = 6
@@ -46,6 +48,8 @@ class TreeSplitConfig:
         for name in ("significance", "strong"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if self.stay is not None and not 0 <= self.stay <= 1:
+            raise ValueError(f"stay must be None or between 0 and 1, got {self.stay}")
         for name in ("minimum_weight", "minimum_effect", "pseudo"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} must be at least 0, got {getattr(self, name)}")
