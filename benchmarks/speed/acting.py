@@ -2,32 +2,63 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from timing import medians
+from timing import LACKING, medians, on_cpu, reason
+from workloads import AGENT
 
 import jaxpomdp as jp
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.trial import Actor, run_trials
 from jaxpomdp.envs import world as worlds
-from jaxpomdp.models.init import stack_models
 
-AGENTS = (21, 1024, 16384)
-STATES = 70
+AGENTS = (21, 1024, 16384, 131072)
+STATES = AGENT.states
 CONTROL = ControlConfig(alpha=0.01, gamma=0.95, lam=0.9, schedule=Schedule(0.2, 0.2, 1, "constant"))
 
+Entry = tuple[Callable[[], Any], int]
+"""A call, and the steps that it takes."""
 
-def agents(count: int, plan: str, *, own_model: bool) -> tuple[Any, int]:
+
+DISTINCT = 1024
+"""So many models differ; more are copies."""
+
+
+@partial(jax.jit, static_argnames="count")
+def random_models(count: int) -> Any:
+    """Draw models on the device, every row of probabilities evenly from all there are."""
+    world = jp.make("maze89")
+    like = jp.random_params(0, STATES, world.num_actions, world.num_observations)
+    (channel,) = like.emissions
+
+    def rows(key: jax.Array, log_prob: jax.Array) -> jax.Array:
+        return jax.nn.log_softmax(jnp.log(jax.random.exponential(key, log_prob.shape)))
+
+    def model(key: jax.Array) -> Any:
+        init, trans, emit = jax.random.split(key, 3)
+        return replace(
+            like,
+            log_init=rows(init, like.log_init),
+            log_trans=rows(trans, like.log_trans),
+            emissions=(replace(channel, log_prob=rows(emit, channel.log_prob)),),
+        )
+
+    some = jax.vmap(model)(jax.random.split(jax.random.key(0), min(count, DISTINCT)))
+    return jax.tree.map(lambda x: x[jnp.arange(count) % DISTINCT], some)
+
+
+def agents(count: int, plan: str, *, own_model: bool) -> Entry:
     """Return a call that runs a trial of every agent, and the steps that it takes."""
     world = jp.make("maze89")
-    sizes = (STATES, world.num_actions, world.num_observations)
-    models = stack_models([jp.random_params(seed, *sizes) for seed in range(count if own_model else 1)])
+    models = random_models(count if own_model else 1)
     keys = jax.vmap(lambda seed: jax.random.key_data(jax.random.key(seed)))(jnp.arange(count))
     zero = jnp.zeros(count, jnp.int32)
     actor = Actor(keys, jnp.zeros((count, STATES, world.num_actions)), zero, zero)
@@ -112,22 +143,39 @@ def gymnasium_loop(steps: int = 5000) -> float:
     return steps / (time.perf_counter() - begin)
 
 
-def compare(rounds: int) -> dict[str, Any]:
-    """Return environment steps per second for each number of agents, and of each peer."""
-    rows = {}
-    for count in AGENTS:
-        entries = {
-            "ours, one model": agents(count, "auto", own_model=False),
-            "ours, one model, XLA only": agents(count, "loop", own_model=False),
-            "our worlds alone": worlds_alone(count),
-        }
-        if count <= 1024:
-            entries["ours, a model each"] = agents(count, "auto", own_model=True)
-        with contextlib.suppress(ImportError):
-            entries["gymnax's MemoryChain alone"] = gymnax_alone(count)
-        for call, _ in entries.values():
-            call()
+def makers(count: int) -> dict[str, Callable[[], Entry]]:
+    """Return how to make each entry for so many agents."""
+    made: dict[str, Callable[[], Entry]] = {
+        "ours, one model": partial(agents, count, "auto", own_model=False),
+        "our worlds alone": partial(worlds_alone, count),
+        "gymnax's MemoryChain alone": partial(gymnax_alone, count),
+    }
+    if on_cpu():
+        made["ours, one model, XLA only"] = partial(agents, count, "loop", own_model=False)
+    if count <= 1024 or not on_cpu():
+        made["ours, a model each"] = partial(agents, count, "auto", own_model=True)
+    return made
+
+
+def compare(rounds: int) -> Iterator[dict[str, Any]]:
+    """Yield environment steps per second for each number of agents, and of each peer."""
+    rows: dict[str, dict[str, Any]] = {}
+    left_out: dict[str, str] = {}
+    for count in AGENTS[: 3 if on_cpu() else None]:
+        entries = {}
+        for name, make in makers(count).items():
+            try:
+                entries[name] = make()
+                entries[name][0]()
+            except LACKING as error:
+                which = name if isinstance(error, ImportError) else f"{name}, {count:,} agents"
+                left_out[which] = reason(error)
+                entries.pop(name, None)
         taken = medians({name: call for name, (call, _) in entries.items()}, rounds, 30)
         rows[str(count)] = {name: steps / taken[name] for name, (_, steps) in entries.items()}
-    rows["1"] = {"a NumPy agent in a Gymnasium loop": gymnasium_loop()}
-    return rows
+        yield {"W5": rows | {"left_out": left_out}}
+    try:
+        rows["1"] = {"a NumPy agent in a Gymnasium loop": gymnasium_loop()}
+    except ImportError as error:
+        left_out["a NumPy agent in a Gymnasium loop"] = reason(error)
+    yield {"W5": rows | {"left_out": left_out}}

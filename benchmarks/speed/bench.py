@@ -1,8 +1,11 @@
 """How fast this is, beside what a user would pick instead and beside the machine's limit: `make bench`.
 
-    python benchmarks/speed/bench.py [--only W1 W5 ...] [--rounds 7] [--out benchmarks/results]
+    python benchmarks/speed/bench.py [--only W2 W5 ...] [--name speed] [--rounds 7] [--minutes 30]
 
-Writes speed.json and speed.png. Peers that are not installed are left out, and said so.
+Writes NAME.json, NAME.md and NAME.png after every part. Peers that are not installed are left out, and said
+so. `--only` without a part writes the page and the picture again. On a machine with a GPU, as it is:
+
+    PYTHONPATH=. python3 benchmarks/speed/bench.py --name speed-gpu --rounds 5 --budget 3 --minutes 6.5
 """
 
 from __future__ import annotations
@@ -11,21 +14,20 @@ import argparse
 import json
 import os
 import platform
-import resource
-import subprocess
-import sys
-from collections.abc import Iterator
+import time
+import traceback
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import acting
-import inference
-import training
-from timing import limits
-from workloads import LOADS
+from processes import Settings, last_result
 
-PARTS = (*LOADS, "W5", "W6", "growth")
+LOADS = ("W2", "W1", "W3", "W4")
+PARTS = (*LOADS, "seeds", "W5", "long", "memory", "W6", "growth")
+"""In order of importance, for when time runs out."""
+
 PEERS = ("dynamax", "hmmlearn", "pomegranate", "torch", "gymnax", "gymnasium")
 
 
@@ -40,6 +42,11 @@ def versions() -> dict[str, str]:
     return found
 
 
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 def machine() -> str:
     """Describe the processor."""
     try:
@@ -47,110 +54,106 @@ def machine() -> str:
         model = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {len(os.sched_getaffinity(0))} cores"
+    return f"{model}, {cores()} cores"
 
 
-def child(task: str, *, wide: bool = False) -> dict[str, Any]:
-    """Do one task in a process of its own, and return what it prints."""
-    environment = os.environ | {"JAX_ENABLE_X64": "1" if wide else "0"}
-    arguments = [sys.executable, __file__, "--task", task]
-    done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode:
-        return {"error": done.stderr.strip().splitlines()[-1] if done.stderr else str(done.returncode)}
-    return json.loads(done.stdout.splitlines()[-1])
+def memory(result: Mapping[str, Any], until: float) -> dict[str, Any]:
+    """Return the parts of a result with the memory that each contestant takes, measured side by side."""
+    pairs = [(part, who) for part in LOADS if part in result for who in result[part].get("contestants", {})]
+
+    def peak(pair: tuple[str, str]) -> float | None:
+        return last_result(f"memory {' '.join(pair)}", Settings(), until).get("mebibytes")
+
+    with ThreadPoolExecutor(max(cores() // 2, 1)) as pool:
+        peaks = list(pool.map(peak, pairs))
+    for (part, who), value in zip(pairs, peaks, strict=True):
+        result[part]["contestants"][who]["peak_mebibytes"] = value
+    return {part: result[part] for part, _ in pairs}
 
 
-def peak_memory(name: str, who: str) -> dict[str, float]:
-    """Return the mebibytes that one contestant needed beyond what was there before it ran."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    inference.prepared(LOADS[name], [who])
-    return {"mebibytes": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024}
+def shares(result: dict[str, Any]) -> None:
+    """Put down what each contestant makes of the machine's arithmetic."""
+    from workloads import LOADS as loads
+
+    limit = result.get("limits", {}).get("gflops")
+    for part in (p for p in LOADS if limit and p in result):
+        for row in result[part]["contestants"].values():
+            row["share_of_gemm_peak"] = loads[part].flop / row["milliseconds"] / 1e6 / limit
 
 
-def totals(name: str, plan: str) -> dict[str, Any]:
-    """Return what tells float32 from float64: the log-evidence of every trial, and all counts."""
-    found = inference.outcome(name, plan)
-    return {"evidence": found["evidence"].ravel().tolist(), "xi": found["xi"].ravel().tolist()}
-
-
-def accuracy(name: str) -> dict[str, float]:
-    """Return the largest relative errors of float32 against float64."""
-    import numpy as np
-
-    single, double = child(f"totals {name} auto"), child(f"totals {name} grouped", wide=True)
-    evidence, exact = np.array(single["evidence"]), np.array(double["evidence"])
-    counts, true = np.array(single["xi"]), np.array(double["xi"])
-    return {
-        "log_evidence": float(np.max(np.abs(evidence - exact) / np.abs(exact))),
-        "counts": float(np.max(np.abs(counts - true)) / np.max(true)),
-    }
-
-
-def measure(parts: list[str], rounds: int, budget: float) -> Iterator[dict[str, Any]]:
-    """Yield each part that was asked for once it is measured, so that a run cut short keeps the rest."""
-    limit = limits()
-    yield {"limits": limit}
-    for part in parts:
-        print(f"{part} ...", file=sys.stderr, flush=True)
-        if part in LOADS:
-            found = inference.compare(part, rounds, budget, limit)
-            for who, row in found["contestants"].items():
-                row["peak_mebibytes"] = child(f"memory {part} {who}").get("mebibytes")
-            found["float32_error"] = accuracy(part)
-        elif part == "W5":
-            found = acting.compare(rounds)
-        elif part == "W6":
-            found = training.compare()
+def measure(parts: list[str], settings: Settings, until: float, result: dict[str, Any]) -> Iterator[str]:
+    """Put each part into a result and yield its name, so that a run cut short keeps the rest."""
+    for part in ["limits", *parts] if parts else []:
+        left = until - time.monotonic()
+        if left <= 0:
+            return
+        begin = time.monotonic()
+        if part == "memory":
+            found = memory(result, until)
         else:
-            found = inference.growth(max(rounds // 2, 1))
-        yield {part: found}
+            patient = Settings(settings.rounds, settings.budget, min(settings.patience, left / 2))
+            found = last_result(part, patient, until)
+        problem = {part: found.pop("error", "")}
+        result |= found
+        shares(result)
+        result["problems"] = result.get("problems", {}) | problem
+        result["seconds"] = result.get("seconds", {}) | {part: round(time.monotonic() - begin, 1)}
+        yield part
 
 
-def show(result: dict[str, Any]) -> None:
-    """Print the tables."""
-    for part in (p for p in LOADS if p in result):
-        print(f"\n{part}: {result[part]['what']}")
-        for who, row in result[part]["contestants"].items():
-            times, share = row["times_ours"], 100 * row["share_of_gemm_peak"]
-            print(f"  {who:22}{row['milliseconds']:12.1f} ms{times:9.1f} x ours{share:7.1f} % of GEMM")
-    for count, row in result.get("W5", {}).items():
-        print(f"\nW5: {count} agents, steps per second")
-        for who, value in row.items():
-            print(f"  {who:34}{value:14,.0f}")
-    for kind, row in result.get("W6", {}).items():
-        print(f"\nW6, cache {kind}: " + ", ".join(f"{name} {value:.1f} s" for name, value in row.items()))
+def write(result: dict[str, Any], out: Path) -> None:
+    """Write the result, its page and its picture."""
+    from figures import draw
+    from page import page
+
+    name = result["name"]
+    (out / f"{name}.json").write_text(json.dumps(result, indent=1) + "\n")
+    (out / f"{name}.md").write_text(page(result))
+    draw(result, out / f"{name}.png")
+
+
+def task(name: str, settings: Settings) -> None:
+    """Do what the parent process asked for: print a line for each result, and what went wrong."""
+    from tasks import results
+
+    found: dict[str, Any] = {}
+    try:
+        for found in results(name, settings):
+            print(json.dumps(found), flush=True)
+    except Exception as error:
+        traceback.print_exc()
+        told = next(iter(str(error).splitlines()), "")[:300]
+        print(json.dumps(found | {"error": f"{type(error).__name__}: {told}"}), flush=True)
 
 
 def main() -> None:
     """Parse, measure, write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--budget", type=float, default=60.0, help="seconds a contestant may use up")
+    parser.add_argument("--only", nargs="*", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--name", default="speed", help="of the files that are written")
+    parser.add_argument("--rounds", type=int, default=Settings.rounds)
+    parser.add_argument("--budget", type=float, default=Settings.budget, help="seconds for each contestant")
+    parser.add_argument("--patience", type=float, default=Settings.patience, help="seconds for a run of W6")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so many")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"))
     parser.add_argument("--task", help=argparse.SUPPRESS)
     options = parser.parse_args()
+    settings = Settings(options.rounds, options.budget, options.patience)
     if options.task:
-        kind, name, who = options.task.split(" ", 2)
-        print(json.dumps(peak_memory(name, who) if kind == "memory" else totals(name, who)))
-        return
-    path = options.out / "speed.json"
-    result = json.loads(path.read_text()) if path.exists() else {}
-    result |= {
-        "name": "speed",
-        "command": "python benchmarks/speed/bench.py",
-        "machine": machine(),
-        "versions": versions(),
-    }
+        return task(options.task, settings)
+    until = time.monotonic() + 60 * options.minutes
+    path = options.out / f"{options.name}.json"
+    result = json.loads(path.read_text()) if path.exists() else {"name": options.name}
+    if options.only:
+        named = "" if options.name == "speed" else f" --name {options.name}"
+        command = f"python benchmarks/speed/bench.py{named}"
+        result |= {"command": command, "machine": machine(), "versions": versions()}
     options.out.mkdir(parents=True, exist_ok=True)
-    for found in measure(options.only, options.rounds, options.budget):
-        result |= found
-        path.write_text(json.dumps(result, indent=1) + "\n")
-        show(found)
-    from figures import draw
-
-    draw(result, options.out / "speed.png")
-    print(f"\nwritten: {path} and speed.png")
+    write(result, options.out)
+    for part in measure([p for p in PARTS if p in options.only], settings, until, result):
+        write(result, options.out)
+        print(f"{part}: {result['seconds'][part]} s. {result['problems'][part]}", flush=True)
+    print(f"written: {path}, {options.name}.md and {options.name}.png")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import on_cpu
 from workloads import Data, Load, log_likelihood
 
 from jaxpomdp import Chain
@@ -26,8 +27,14 @@ MISSING = {
     "hmmlearn": "no actions, no batch of models: one model with as many sequences; less work than ours",
     "pomegranate": "no actions, no batch of models: one model with as many sequences; less work than ours",
     "NumPy loop": "the textbook's loop over time with all trials of a model at once; equal work",
+    "ours, XLA only": "plan `grouped`",
+    "ours, mapped": "plan `scan`",
+    "ours, blocked": "plan `blocked`",
 }
-"""What each peer lacks, and what it is given instead."""
+"""What each peer lacks, and what it is given instead; which plan of ours it is."""
+
+LONG = 10_000
+"""From so many steps on, tapes are cut into blocks on a CPU too, for comparison; it has nothing to gain."""
 
 GIBIBYTES = 6
 """A contestant that would need more than this for one array is left out."""
@@ -149,9 +156,21 @@ def _by_numpy(
 CONTESTANTS: dict[str, Callable[[Load, Data], Call]] = {
     "ours": ours("auto"),
     "ours, XLA only": ours("grouped"),
+    "ours, mapped": ours("scan"),
+    "ours, blocked": ours("blocked"),
     "dynamax, actions": dynamax_with_actions,
     "dynamax, no actions": dynamax_without_actions,
     "hmmlearn": hmmlearn,
     "pomegranate": pomegranate,
     "NumPy loop": numpy_loop,
 }
+
+ON_THE_CPU = ("hmmlearn", "pomegranate", "NumPy loop")
+
+
+def entrants(load: Load) -> list[str]:
+    """Return who is timed on this device: peers that use it, and plans of ours that are meant for it."""
+    if not on_cpu():
+        return [name for name in CONTESTANTS if name not in ON_THE_CPU]
+    spared = {"ours, mapped"} | ({"ours, blocked"} if load.steps < LONG else set())
+    return [name for name in CONTESTANTS if name not in spared]

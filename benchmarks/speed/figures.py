@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +11,27 @@ from workloads import LOADS
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Draw what a result holds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(3, 4, figsize=(18, 12), layout="constrained")
+    figure, axes = plt.subplots(3, 5, figsize=(23, 12), layout="constrained")
     flat = list(axes.flat)
     for part in (p for p in LOADS if p in result):
         _bars(flat.pop(0), f"{part}: milliseconds an E-step", result[part])
-    if "W5" in result:
-        _acting(flat.pop(0), result["W5"])
-    if "W6" in result:
-        _training(flat.pop(0), result["W6"])
+    for name, one in (("W5", _acting), ("W6", _training), ("seeds", _seeds), ("long", _long)):
+        if name in result:
+            one(flat.pop(0), result[name])
     for letter, curve in result.get("growth", {}).items():
         axis = flat.pop(0)
         for who, times in curve["milliseconds"].items():
-            axis.loglog(curve["sizes"], times, marker="o", label=who)
+            axis.loglog(curve["sizes"][: len(times)], times, marker="o", label=who)
         axis.set(title=f"growth with {letter}", xlabel=letter, ylabel="ms an E-step")
         axis.legend()
     for axis in flat:
         axis.set_axis_off()
-    figure.savefig(path, dpi=80)
+    figure.savefig(path, dpi=70)
     plt.close(figure)
 
 
@@ -39,17 +42,27 @@ def _bars(axis: Any, title: str, part: dict[str, Any]) -> None:
     axis.invert_yaxis()
 
 
+def _curves(axis: Any, curves: Mapping[str, Mapping[Any, float]], **labels: str) -> None:
+    """Draw ``name -> size -> value``."""
+    for name, curve in curves.items():
+        sizes = sorted((int(size), value) for size, value in curve.items())
+        if sizes:
+            axis.loglog(*zip(*sizes, strict=True), marker="o", label=name)
+    axis.set(**labels)
+    if axis.lines:
+        axis.legend(fontsize=7)
+
+
 def _acting(axis: Any, part: dict[str, Any]) -> None:
-    names = sorted({name for row in part.values() for name in row})
-    for name in names:
-        sizes = sorted((int(count), row[name]) for count, row in part.items() if name in row)
-        axis.loglog(*zip(*sizes, strict=True), marker="o", label=name)
-    axis.set(title="W5: steps per second", xlabel="agents")
-    axis.legend(fontsize=7)
+    rows = {count: row for count, row in part.items() if count.isdigit()}
+    names = sorted({name for row in rows.values() for name in row})
+    curves = {name: {n: row[name] for n, row in rows.items() if name in row} for name in names}
+    _curves(axis, curves, title="W5: steps per second", xlabel="agents")
 
 
 def _training(axis: Any, part: dict[str, Any]) -> None:
-    names = [name for name in part["warm"] if name not in ("wall", "all", "compiling")]
+    told = ("wall", "all", "compiling", "stopped_after", "trials")
+    names = list(dict.fromkeys(name for row in part.values() for name in row if name not in told))
     for place, kind in enumerate(part):
         left = 0.0
         for index, name in enumerate(names):
@@ -57,4 +70,22 @@ def _training(axis: Any, part: dict[str, Any]) -> None:
             axis.barh(place, spent, left=left, color=f"C{index}", label=name if place == 0 else None)
             left += spent
     axis.set(title="W6: seconds of 1,000 trials x 21 seeds", yticks=range(len(part)), yticklabels=list(part))
-    axis.legend(fontsize=7)
+    if names:
+        axis.legend(fontsize=7)
+
+
+def _seeds(axis: Any, part: dict[str, Any]) -> None:
+    plans = list(dict.fromkeys(plan for row in part["rows"] for plan in row["milliseconds"]))
+    curves = {
+        plan: {
+            row["models"]: row["milliseconds"][plan] / row["models"]
+            for row in part["rows"]
+            if plan in row["milliseconds"]
+        }
+        for plan in plans
+    }
+    _curves(axis, curves, title="ms a model, an E-step like W2's", xlabel="models")
+
+
+def _long(axis: Any, part: dict[str, Any]) -> None:
+    _curves(axis, part["milliseconds"], title="one tape: ms an E-step", xlabel="T")

@@ -24,6 +24,12 @@ class Load(NamedTuple):
         """What an E-step cannot do without: forward, backward and counts are each ``2 N^2`` a step."""
         return 6.0 * self.models * self.trials * self.steps * self.states**2
 
+    @property
+    def bytes(self) -> float:
+        """What it must move in float32: likelihoods in, beliefs out and in, posteriors out; matrices."""
+        rows = self.models * self.trials * self.steps * self.states
+        return 4.0 * (4 * rows + 2 * self.models * self.actions * self.states**2)
+
     def __str__(self) -> str:
         return (
             f"{self.models} models x {self.trials} trials x T = {self.steps:,}, "
@@ -37,6 +43,28 @@ LOADS = {
     "W3": Load(1, 64, 1000, 256, 4, 64),
     "W4": Load(1, 1, 100_000, 32, 4, 32),
 }
+
+
+AGENT = Load(models=1, trials=1, steps=1, states=70, actions=5, symbols=21)
+"""The size of an agent in the 89-state maze."""
+
+
+class Cost(NamedTuple):
+    """What one step of one agent cannot do without: floating-point operations, and bytes in float32."""
+
+    flop: float
+    bytes: float
+
+
+def step_cost(*, own_model: bool) -> Cost:
+    """Return the cost of a belief update, ``2 N^2``, and of SARSA(lambda) on it.
+
+    Values and traces ``[N, A]`` are read and written; beliefs too, and a column of emissions read. The matrix
+    of the action is read as well if each agent has its own; one that all share stays in the cache.
+    """
+    states, entries = AGENT.states, AGENT.states * AGENT.actions
+    flop = 2.0 * states**2 + 5 * entries + 6 * states
+    return Cost(flop, 4.0 * (4 * entries + 3 * states + (states**2 if own_model else 0)))
 
 
 class Data(NamedTuple):

@@ -8,6 +8,7 @@ probabilities; ``smoothing`` notices when that mattered and works in logarithms 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -128,6 +129,31 @@ def linked_steps(start: Array, valid: Array) -> Array:
     return jnp.concatenate([goes_on[..., 1:], nothing], axis=-1)
 
 
+def filter_step(
+    init: Array, trans: Array, carried: Array, inputs: tuple[Array, Array, Array]
+) -> tuple[Array, Filtered]:
+    """Filter one step: ``predicted = carried``, or ``init`` at a start; then ``observe`` and ``propagate``.
+
+    Args:
+        init: probabilities ``[N]``.
+        trans: probabilities ``[A, N, N]``.
+        carried: ``[N]``, what the step before says of this one.
+        inputs: ``log_obs[N]``, the action, and whether a trial starts here.
+
+    Returns:
+        What this step says of the next one, ``[N]``, and the step itself.
+    """
+    row, action, first = inputs
+    predicted = jnp.where(first, init, carried)
+    belief, log_norm = observe(predicted, row)
+    return propagate(belief, trans, action), Filtered(belief, predicted, log_norm)
+
+
+def without_padding(filtered: Filtered, valid: Array) -> Filtered:
+    """Set rows of a filtered tape to zero at padding."""
+    return jax.tree.map(lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 1)), x, 0), filtered)
+
+
 def filter_tape(chain: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> Filtered:
     """Filter one tape: ``predicted_t = belief_{t-1} T(a_{t-1})``, or ``init`` at a start; then ``observe``.
 
@@ -139,14 +165,7 @@ def filter_tape(chain: Chain, log_obs: Array, actions: Array, start: Array, vali
         valid: bool ``[T]``, False at padding.
     """
     init, trans = jnp.exp(chain.log_init), jnp.exp(chain.log_trans)
-
-    def step(carried: Array, inputs: tuple[Array, ...]) -> tuple[Array, Filtered]:
-        row, action, first = inputs
-        predicted = jnp.where(first, init, carried)
-        belief, log_norm = observe(predicted, row)
-        return propagate(belief, trans, action), Filtered(belief, predicted, log_norm)
-
     first = trial_starts(start, valid)
     rows = jnp.where(valid[:, None], log_obs, 0)
-    _, filtered = lax.scan(step, init, (rows, actions, first))
-    return jax.tree.map(lambda x: jnp.where(valid.reshape(valid.shape + (1,) * (x.ndim - 1)), x, 0), filtered)
+    _, filtered = lax.scan(partial(filter_step, init, trans), init, (rows, actions, first))
+    return without_padding(filtered, valid)

@@ -2,12 +2,15 @@
 
 - ``scan`` is the definition: ``smooth`` under two maps.
 - ``grouped`` carries the whole batch through time at once (``grouped``), for any device and dtype.
+- ``blocked`` cuts tapes into blocks that go through time side by side (``blocked``), for long tapes of few
+  small models on an accelerator.
 - ``native`` is the loop in C++ (``native``), on CPU in float32 where it could be built.
-- ``auto`` takes ``native`` where it can and ``grouped`` elsewhere.
+- ``auto`` takes ``native`` where it can, ``blocked`` off the CPU where that pays, and ``grouped`` elsewhere.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 
@@ -17,6 +20,7 @@ from jax import lax
 
 from jaxpomdp._types import Array, Chain, Posterior
 from jaxpomdp.kernels import native
+from jaxpomdp.kernels.blocked import smooth_blocked
 from jaxpomdp.kernels.grouped import smooth_grouped
 from jaxpomdp.kernels.smoothing import smooth, smooth_exact
 
@@ -31,6 +35,15 @@ def _scan_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, vali
 def _grouped_plan(chains: Chain, *tapes: Array) -> Posterior:
     """Smooth in groups, then add the tapes that underflowed, one by one, by ``smooth_exact``."""
     return _complete(*smooth_grouped(chains, *tapes), chains, *tapes)
+
+
+def _blocked_plan(chains: Chain, *tapes: Array) -> Posterior:
+    """Map ``smooth_blocked`` over tapes and models, add counts, then add the tapes that underflowed."""
+    over_tapes = jax.vmap(smooth_blocked, in_axes=(None, 0, 0, 0, 0))
+    each, trusted = jax.vmap(over_tapes)(chains, *tapes)
+    xi = jnp.sum(jnp.where(trusted[..., None, None, None], each.xi, 0), axis=1)
+    initial = jnp.sum(jnp.where(trusted[..., None], each.initial, 0), axis=1)
+    return _complete(each._replace(xi=xi, initial=initial), trusted, chains, *tapes)
 
 
 def _complete(result: Posterior, trusted: Array, chains: Chain, *tapes: Array) -> Posterior:
@@ -61,6 +74,7 @@ def _native_plan(chains: Chain, log_obs: Array, actions: Array, start: Array, va
 _PLANS: dict[str, Callable[..., Posterior]] = {
     "scan": _scan_plan,
     "grouped": _grouped_plan,
+    "blocked": _blocked_plan,
     "native": _native_plan,
 }
 
@@ -68,8 +82,21 @@ PLANS = ("auto", *_PLANS)
 """Names of the evaluation plans."""
 
 
-def choose_plan(plan: str, dtype: jnp.dtype) -> str:
-    """Resolve ``auto``, and check that a named plan can run here.
+HIDDEN_WORK = 1e8
+"""Multiply-adds that an accelerator does in the least time that one step of a loop takes it."""
+
+
+def blocks_pay(models: int, tapes: int, steps: int, states: int) -> bool:
+    """Say whether ``blocked`` should beat ``grouped`` off the CPU.
+
+    In units of that least time, ``grouped`` takes ``2 T``, and ``blocked`` takes ``5 sqrt(T)`` besides its
+    products of step matrices, ``S B T N^3 / HIDDEN_WORK``.
+    """
+    return 5 * math.sqrt(steps) + models * tapes * steps * states**3 / HIDDEN_WORK < 2 * steps
+
+
+def choose_plan(plan: str, dtype: jnp.dtype, sizes: tuple[int, int, int, int]) -> str:
+    """Resolve ``auto`` for ``sizes = (S, B, T, N)``, and check that a named plan can run here.
 
     Raises:
         ValueError: ``plan`` is not known, or is ``native`` where that cannot run.
@@ -79,9 +106,11 @@ def choose_plan(plan: str, dtype: jnp.dtype) -> str:
     fits = plan in ("auto", "native") and dtype == jnp.float32 and native.available()
     if plan == "native" and not fits:
         raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
-    if plan == "auto":
-        return "native" if fits else "grouped"
-    return plan
+    if plan != "auto":
+        return plan
+    if fits:
+        return "native"
+    return "blocked" if jax.default_backend() != "cpu" and blocks_pay(*sizes) else "grouped"
 
 
 @partial(jax.jit, static_argnames="plan")
@@ -110,7 +139,9 @@ def posterior(
         ValueError: ``plan`` is not known or cannot run here, or the shapes do not fit.
     """
     _check_shapes(chains, log_obs, actions, start, valid)
-    return _posterior(chains, log_obs, actions, start, valid, plan=choose_plan(plan, log_obs.dtype))
+    return _posterior(
+        chains, log_obs, actions, start, valid, plan=choose_plan(plan, log_obs.dtype, log_obs.shape)
+    )
 
 
 def _check_shapes(chains: Chain, log_obs: Array, actions: Array, start: Array, valid: Array) -> None:

@@ -13,6 +13,8 @@ the rounding of the dtype.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -34,6 +36,15 @@ def relative_likelihood(log_obs: Array, valid: Array) -> Array:
     return jnp.where(valid[..., None], weight, 1)
 
 
+def backward_step(trans: Array, following: Array, inputs: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Go one step back: from ``future_{t+1}`` to ``future_t``, twice; ``inputs`` as ``backward_weights``."""
+    here, action, goes_on = inputs
+    beta = jnp.matmul(trans[action], following, precision=EXACT)
+    peak = jnp.max(beta)
+    beta = jnp.where(goes_on, beta / jnp.where(peak > 0, peak, 1), 1)
+    return here * beta, here * beta
+
+
 def backward_weights(trans: Array, weight: Array, actions: Array, linked: Array) -> Array:
     """Run backward: ``future_t = weight_t beta_t``, ``beta_t(i) ∝ sum_j trans(a_t, i, j) future_{t+1}(j)``.
 
@@ -48,15 +59,8 @@ def backward_weights(trans: Array, weight: Array, actions: Array, linked: Array)
     Returns:
         ``future[T, N]``, in proportion to the probability of this and all later observations of the trial.
     """
-
-    def step(following: Array, inputs: tuple[Array, ...]) -> tuple[Array, Array]:
-        here, action, goes_on = inputs
-        beta = jnp.matmul(trans[action], following, precision=EXACT)
-        peak = jnp.max(beta)
-        beta = jnp.where(goes_on, beta / jnp.where(peak > 0, peak, 1), 1)
-        return here * beta, here * beta
-
-    return lax.scan(step, jnp.ones_like(weight[0]), (weight, actions, linked), reverse=True)[1]
+    inputs = (weight, actions, linked)
+    return lax.scan(partial(backward_step, trans), jnp.ones_like(weight[0]), inputs, reverse=True)[1]
 
 
 def transition_counts(trans: Array, belief: Array, arriving: Array, actions: Array, linked: Array) -> Array:
@@ -91,6 +95,26 @@ def smooth_scaled(
     trans, linked = jnp.exp(chain.log_trans), linked_steps(start, valid)
     filtered = filter_tape(chain, log_obs, actions, start, valid)
     future = backward_weights(trans, relative_likelihood(log_obs, valid), actions, linked)
+    return join_passes(trans, filtered, future, actions, start, valid)
+
+
+def join_passes(
+    trans: Array, filtered: Filtered, future: Array, actions: Array, start: Array, valid: Array
+) -> tuple[Posterior, Array]:
+    """Join what the past and the future say of each step: ``gamma_t ∝ predicted_t future_t``.
+
+    Args:
+        trans: probabilities ``[A, N, N]``.
+        filtered: the forward pass.
+        future: the backward pass, ``[T, N]``, as ``backward_weights`` scales it.
+        actions: int ``[T]``.
+        start: bool ``[T]``.
+        valid: bool ``[T]``.
+
+    Returns:
+        As ``smooth_scaled``.
+    """
+    linked = linked_steps(start, valid)
     joint = filtered.predicted * future
     overlap = jnp.sum(joint, axis=-1, keepdims=True)
     trusted = overlap >= overlap_floor(overlap.dtype)

@@ -1,24 +1,28 @@
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxpomdp._types import Posterior
-from jaxpomdp.kernels import grouped, native
+from jaxpomdp.kernels import blocked, grouped, native
 from jaxpomdp.kernels.grouped import capacities, group_rows, grouped_product, smooth_grouped
 from jaxpomdp.kernels.posterior import choose_plan, posterior
 from tests.kernels.problems import Problem, quick_jit, random_problem, stack, with_tape
 from tests.kernels.test_smoothing import two_worlds
 from tests.oracles.hmm import enumerate_tape
 
+LONG = (1, 1, 100_000, 32)
 CLOSE = {"rtol": 1e-10, "atol": 1e-10}
 run = quick_jit(posterior, static_argnames="plan")
 SINGLE = {"rtol": 2e-5, "atol": 2e-5}
 
 needs_native = pytest.mark.skipif(not native.available(), reason="needs a compiler for the native kernels")
-BATCHED = ["grouped", pytest.param("native", marks=needs_native)]
+BATCHED = ["grouped", "blocked", pytest.param("native", marks=needs_native)]
+WIDE = ["scan", "grouped", "blocked"]
 
 
 def batch(models: int, tapes: int, **options: float) -> list[list[Problem]]:
@@ -43,7 +47,7 @@ def assert_enumerated(problems: list[list[Problem]], got: Posterior, **close: fl
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("plan", ["scan", "grouped"])
+@pytest.mark.parametrize("plan", WIDE)
 def test_each_plan_equals_enumeration(plan: str) -> None:
     for options in ({"starts": 0.3, "missing": 0.2}, {"zeros": 0.4, "padding": 1}):
         problems = batch(2, 5, **options)
@@ -112,6 +116,26 @@ def test_the_oracle_notices_a_product_with_the_wrong_group(monkeypatch: pytest.M
     assert not np.allclose(got.xi[0], want, atol=1e-3)
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("length", [1, 2, 5, 6])
+def test_blocks_of_any_length(length: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blocked, "block_length", lambda steps: length)
+    problems = batch(2, 3, starts=0.3, missing=0.2, padding=1)
+    assert_enumerated(problems, quick_jit(partial(posterior, plan="blocked"))(*stack(problems)), **CLOSE)
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_oracle_notices_blocks_that_forget_how_probable_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    def forgetful(init: jax.Array, responses: blocked.Response) -> jax.Array:
+        return right(init, responses._replace(log_prob=jnp.zeros_like(responses.log_prob)))
+
+    right = blocked._predictions
+    monkeypatch.setattr(blocked, "_predictions", forgetful)
+    problem = random_problem(0, steps=9)
+    got, _ = quick_jit(lambda *x: blocked.smooth_blocked(*x))(*problem.jax())
+    assert not np.isclose(got.log_evidence, enumerate_tape(*problem).log_evidence, atol=1e-3)
+
+
 def test_rows_are_sorted_by_action_in_order() -> None:
     actions = jnp.array([[2, 0, 1, 0, 2, 1, 0]])
     linked = jnp.array([[True, True, True, True, True, False, True]])
@@ -144,12 +168,22 @@ def test_capacities_are_ascending_and_end_with_everything() -> None:
 
 def test_auto_prefers_native_and_never_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(native, "available", lambda: True)
-    assert choose_plan("auto", jnp.float32) == "native"
-    assert choose_plan("auto", jnp.float64) == "grouped"
+    assert choose_plan("auto", jnp.float32, LONG) == "native"
+    assert choose_plan("auto", jnp.float64, LONG) == "grouped"
     monkeypatch.setattr(native, "available", lambda: False)
-    assert choose_plan("auto", jnp.float32) == "grouped"
+    assert choose_plan("auto", jnp.float32, LONG) == "grouped"
     with pytest.raises(ValueError, match="native"):
-        choose_plan("native", jnp.float32)
+        choose_plan("native", jnp.float32, LONG)
+
+
+def test_auto_takes_blocks_off_the_cpu_for_long_tapes_of_few_small_models(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert choose_plan("auto", jnp.float32, LONG) == "blocked"
+    assert choose_plan("grouped", jnp.float32, LONG) == "grouped"
+    for others in ((1, 1, 5, 32), (1, 1, 100_000, 1000), (1000, 100, 100_000, 32)):
+        assert choose_plan("auto", jnp.float32, others) == "grouped"
 
 
 def test_bad_arguments_are_named() -> None:
