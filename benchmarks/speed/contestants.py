@@ -53,10 +53,15 @@ def ours(plan: str) -> Callable[[Load, Data], Call]:
     return make
 
 
-def dynamax_with_actions(load: Load, data: Data) -> Call:
-    """Return dynamax's smoother, given ``T[a_t]`` for every step, and counts summed per action."""
+def _refuse_pairs_of_every_step(load: Load) -> None:
+    """Raise where a probability for each step and pair of states, of one model's trials, would not fit."""
     if 4.0 * load.trials * load.steps * load.states**2 > GIBIBYTES * 2**30:
         raise MemoryError("its transition probabilities of every step would not fit")
+
+
+def dynamax_with_actions(load: Load, data: Data) -> Call:
+    """Return dynamax's smoother, given ``T[a_t]`` for every step, and counts summed per action."""
+    _refuse_pairs_of_every_step(load)
     smoother = import_module("dynamax.hidden_markov_model.inference").hmm_smoother
 
     def trial(init: Any, trans: Any, log_obs: Any, actions: Any) -> Any:
@@ -106,6 +111,7 @@ def hmmlearn(load: Load, data: Data) -> Call:
 
 def pomegranate(load: Load, data: Data) -> Call:
     """Return pomegranate's ``forward_backward`` on as many sequences, model by model."""
+    _refuse_pairs_of_every_step(load)
     torch = import_module("torch")
     dense = import_module("pomegranate.hmm").DenseHMM
     categorical = import_module("pomegranate.distributions").Categorical
