@@ -5,7 +5,8 @@
 - ``blocked`` cuts tapes into blocks that go through time side by side (``blocked``), for long tapes of few
   small models on an accelerator.
 - ``native`` is the loop in C++ (``native``), on CPU in float32 where it could be built.
-- ``auto`` takes ``native`` where it can, ``blocked`` off the CPU where that pays, and ``grouped`` elsewhere.
+- ``auto`` takes ``native`` where it can, on an accelerator the plan that measurements there say is fastest
+  for these sizes, and ``grouped`` elsewhere.
 """
 
 from __future__ import annotations
@@ -82,17 +83,18 @@ PLANS = ("auto", *_PLANS)
 """Names of the evaluation plans."""
 
 
-HIDDEN_WORK = 1e8
-"""Multiply-adds that an accelerator does in the least time that one step of a loop takes it."""
+def accelerator_seconds(models: int, tapes: int, steps: int, states: int) -> dict[str, float]:
+    """Return what each plan would take on a GPU.
 
-
-def blocks_pay(models: int, tapes: int, steps: int, states: int) -> bool:
-    """Say whether ``blocked`` should beat ``grouped`` off the CPU.
-
-    In units of that least time, ``grouped`` takes ``2 T``, and ``blocked`` takes ``5 sqrt(T)`` besides its
-    products of step matrices, ``S B T N^3 / HIDDEN_WORK``.
+    A step costs its launches and what it moves, ``S B N^2`` numbers; ``blocked`` makes about ``5 sqrt(T)``
+    steps, and products of step matrices. The constants fit benchmarks/results/speed-gpu.json (an H200).
     """
-    return 5 * math.sqrt(steps) + models * tapes * steps * states**3 / HIDDEN_WORK < 2 * steps
+    moved = models * tapes * states**2
+    return {
+        "scan": steps * (24e-6 + 6.4e-12 * moved),
+        "grouped": steps * (65e-6 + 2.7e-12 * moved),
+        "blocked": 75e-6 * math.sqrt(steps) + 4.2e-13 * moved * steps * states,
+    }
 
 
 def choose_plan(plan: str, dtype: jnp.dtype, sizes: tuple[int, int, int, int]) -> str:
@@ -110,7 +112,10 @@ def choose_plan(plan: str, dtype: jnp.dtype, sizes: tuple[int, int, int, int]) -
         return plan
     if fits:
         return "native"
-    return "blocked" if jax.default_backend() != "cpu" and blocks_pay(*sizes) else "grouped"
+    if jax.default_backend() == "cpu":
+        return "grouped"
+    costs = accelerator_seconds(*sizes)
+    return min(costs, key=lambda name: costs[name])
 
 
 @partial(jax.jit, static_argnames="plan")
