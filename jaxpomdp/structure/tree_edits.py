@@ -7,22 +7,18 @@ it was for any shares. Old leaves and internal states keep their numbers; copies
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxpomdp.structure.spec import safe_log
 from jaxpomdp.structure.tree import TreeSpec, allowed_horizontal, allowed_vertical
 from jaxpomdp.structure.tree_forms import maximal, minimal
+from jaxpomdp.structure.tree_growth import Growth, Shape, branch_copied, level_added
 
 
-class Copied(NamedTuple):
-    """A tree that has grown: its parents, and the old leaf and internal state that each new one reads."""
-
-    leaf_parent: np.ndarray
-    node_parent: np.ndarray
-    leaf_origin: np.ndarray
-    node_origin: np.ndarray
+def shape_of(spec: TreeSpec) -> Shape:
+    """Return the shape of a tree, without its numbers."""
+    return Shape(spec.leaf_parent, spec.node_parent)
 
 
 def branch_leaves(spec: TreeSpec, node: int) -> np.ndarray:
@@ -46,7 +42,7 @@ def clone_branch(spec: TreeSpec, node: int, shares: np.ndarray) -> TreeSpec:
         raise ValueError(f"node must be 0 .. {spec.num_nodes - 1} and not the root, got {node}")
     if shares.shape != (spec.num_nodes + 1,) or (shares < 0).any() or (shares > 1).any():
         raise ValueError(f"shares must be [{spec.num_nodes + 1}] between 0 and 1, got {shares.shape}")
-    copied = _copied(spec, np.array([node]), spec.parent[node] - spec.root)
+    copied = branch_copied(shape_of(spec), node)
     top, twin = _twins(spec, copied, node)
     vertical, horizontal, origin = _read(spec, copied)
     from_rows = shares[origin][None]
@@ -71,11 +67,7 @@ def new_level(spec: TreeSpec, node: int, strong: float) -> TreeSpec:
         raise ValueError(f"node must be an internal state below the root, got {node}")
     most = maximal(spec)
     number = node - spec.root
-    copied = _copied(most, most.children(node), spec.num_internal)
-    copied = copied._replace(
-        node_parent=np.insert(copied.node_parent, spec.num_internal, number),
-        node_origin=np.insert(copied.node_origin, spec.num_internal, number),
-    )
+    copied = level_added(shape_of(most), node)
     vertical, horizontal, _ = _read(most, copied)
     leaves = len(copied.leaf_origin)
     new = leaves + spec.num_internal
@@ -86,33 +78,7 @@ def new_level(spec: TreeSpec, node: int, strong: float) -> TreeSpec:
     return minimal(_grown(most, copied, vertical, horizontal))
 
 
-def _copied(spec: TreeSpec, tops: np.ndarray, parent: int) -> Copied:
-    """Copy the branches of these nodes below internal state ``parent``.
-
-    Where that is a new state (number I), copied internal states are numbered after it.
-    """
-    n, i = spec.num_states, spec.num_internal
-    inside = spec.below[tops].any(0)
-    leaves = np.flatnonzero(inside)
-    internal = np.array([m for m in range(n, n + i) if _within(spec, m, tops)], int) - n
-    first = i + (parent == i)
-    number = np.full(i + 1, -1)
-    number[internal] = first + np.arange(len(internal))
-
-    def moved(old: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        return np.where(np.isin(nodes, tops), parent, number[old])
-
-    leaf_parent = np.concatenate([spec.leaf_parent, moved(spec.leaf_parent[leaves], leaves)])
-    node_parent = np.concatenate([spec.node_parent, moved(spec.node_parent[internal], internal + n)])
-    return Copied(
-        leaf_parent,
-        node_parent,
-        np.concatenate([np.arange(n), leaves]),
-        np.concatenate([np.arange(i), internal]),
-    )
-
-
-def _twins(spec: TreeSpec, copied: Copied, node: int) -> tuple[int, int]:
+def _twins(spec: TreeSpec, copied: Growth, node: int) -> tuple[int, int]:
     """Return the numbers in the grown tree of a branch's top and of its copy."""
     n, i, grown = spec.num_states, spec.num_internal, len(copied.leaf_origin)
     if node < n:
@@ -121,13 +87,7 @@ def _twins(spec: TreeSpec, copied: Copied, node: int) -> tuple[int, int]:
     return grown + node - n, grown + copy
 
 
-def _within(spec: TreeSpec, node: int, tops: np.ndarray) -> bool:
-    while node >= 0 and node not in tops:
-        node = int(spec.parent[node])
-    return node >= 0
-
-
-def _read(spec: TreeSpec, copied: Copied) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read(spec: TreeSpec, copied: Growth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the grown tables, each entry that of the originals where the grown tree has one; and origins."""
     origin = np.concatenate([copied.leaf_origin, copied.node_origin + spec.num_states])
     columns = np.append(origin, spec.num_nodes)
@@ -141,12 +101,11 @@ def _read(spec: TreeSpec, copied: Copied) -> tuple[np.ndarray, np.ndarray, np.nd
     )
 
 
-def _grown(spec: TreeSpec, copied: Copied, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
+def _grown(spec: TreeSpec, copied: Growth, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
     dtype = spec.log_vertical.dtype
     leaves = copied.leaf_origin
     return TreeSpec(
-        copied.leaf_parent,
-        copied.node_parent,
+        *copied.shape,
         safe_log(vertical).astype(dtype),
         safe_log(horizontal).astype(dtype),
         tuple(channel.take(leaves) for channel in spec.emissions),
