@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array, Chain, TrialBatch
-from jaxpomdp.kernels.filtering import filter_tape, linked_steps
+from jaxpomdp.kernels.filtering import filter_tape, trial_starts
 from jaxpomdp.models.em import EMConfig, e_step
 from jaxpomdp.models.family import Family
 from jaxpomdp.structure.tree_evidence import TreeEvidence
@@ -37,7 +37,8 @@ def gather_tree_evidence(
     """Gather ``TreeEvidence`` of ``S`` models on their tapes ``[S, B, T]``: arrays with leading ``S``.
 
     The weight of leaf k before and l now is the smoothed ``xi_t(k, l) = b_{t-1}(k) T_a(k, l) gamma_t(l) /
-    predicted_t(l)``. Bins are even between the least and the largest modelled return of each model's tapes.
+    predicted_t(l)``, that of a start before l ``gamma_t(l)``. Bins are even between the least and the largest
+    modelled return of each model's tapes.
 
     Args:
         family: the kind of model.
@@ -66,9 +67,10 @@ def _of_model(
 ) -> tuple[Array, ...]:
     forward = jax.vmap(partial(filter_tape, chain))
     filtered = forward(log_obs, batch.actions, batch.start, batch.valid)
-    linked = jax.vmap(linked_steps)(batch.start, batch.valid)
+    first = trial_starts(batch.start, batch.valid)
     some = filtered.predicted > 0
     ratio = jnp.where(some, gamma / jnp.where(some, filtered.predicted, 1), 0)
+    ratio = jnp.where(first[..., None], gamma, ratio)
     counted = batch.has_return & batch.valid
     edges = _edges(batch.returns, counted, bins)
     actions = chain.log_trans.shape[0]
@@ -78,14 +80,21 @@ def _of_model(
         jnp.where(counted, batch.actions * bins + place, -1),
         jnp.where(counted, batch.returns, 0),
     )
-    before = jnp.where(linked[..., None], filtered.belief, 0)
-    seen, outcomes, sums = _sums(
-        jnp.exp(chain.log_trans), before, ratio, batch.actions, cells, num_symbols, actions * bins, bins
-    )
+    before = _before(filtered.belief, first, batch.valid)
+    ways = jnp.concatenate([jnp.exp(chain.log_trans), jnp.ones_like(chain.log_trans[:, :1])], axis=1)
+    driving = jnp.roll(batch.actions, 1, axis=-1)
+    seen, outcomes, sums = _sums(ways, before, ratio, driving, cells, num_symbols, actions * bins, bins)
     n = gamma.shape[-1]
-    returns = jnp.moveaxis(outcomes, 0, -1).reshape(n, n, actions, bins)
-    moments = jnp.moveaxis(sums.reshape(actions, 2, n, n), (2, 3), (0, 1))
+    returns = jnp.moveaxis(outcomes, 0, -1).reshape(n + 1, n, actions, bins)
+    moments = jnp.moveaxis(sums.reshape(actions, 2, n + 1, n), (2, 3), (0, 1))
     return jnp.moveaxis(seen, 0, -1), returns, moments, edges
+
+
+def _before(belief: Array, first: Array, valid: Array) -> Array:
+    """Return ``[B, T, N+1]``: the belief of the step before; one in the last place where a trial begins."""
+    linked = valid & ~first
+    leaves = jnp.where(linked[..., None], jnp.roll(belief, 1, axis=1), 0)
+    return jnp.concatenate([leaves, first[..., None].astype(belief.dtype)], axis=-1)
 
 
 def _edges(returns: Array, counted: Array, bins: int) -> Array:
@@ -106,11 +115,10 @@ def _sums(
     num_outcomes: int,
     bins: int,
 ) -> tuple[Array, ...]:
-    """Add up ``xi_t`` by cell in one pass over all tapes laid end to end: ``[cells, N, N]`` each."""
+    """Add up ``xi_t`` by cell in one pass over all tapes laid end to end: ``[cells, N+1, N]`` each."""
 
-    def rows(x: Array, shift: int = 0) -> Array:
-        moved = jnp.roll(x, shift, axis=1) if shift else x
-        return moved.reshape(-1, *x.shape[2:])
+    def rows(x: Array) -> Array:
+        return x.reshape(-1, *x.shape[2:])
 
     def step(carry: tuple[Array, ...], inputs: tuple[Any, ...]) -> tuple[tuple[Array, ...], None]:
         seen, outcomes, sums = carry
@@ -124,11 +132,11 @@ def _sums(
 
     n, dtype = trans.shape[-1], trans.dtype
     blank = (
-        jnp.zeros((num_symbols, n, n), dtype),
-        jnp.zeros((num_outcomes, n, n), dtype),
-        jnp.zeros((num_outcomes // bins, 2, n, n), dtype),
+        jnp.zeros((num_symbols, n + 1, n), dtype),
+        jnp.zeros((num_outcomes, n + 1, n), dtype),
+        jnp.zeros((num_outcomes // bins, 2, n + 1, n), dtype),
     )
-    inputs = (rows(before, 1), rows(actions, 1), rows(ratio), jax.tree.map(rows, cells))
+    inputs = (rows(before), rows(actions), rows(ratio), jax.tree.map(rows, cells))
     return jax.lax.scan(step, blank, inputs)[0]
 
 
@@ -136,10 +144,11 @@ def evidence_of_model(evidence: TreeEvidence, s: int, num_states: int) -> TreeEv
     """Return one model's evidence on the host, without spare slots."""
     host = TreeEvidence(*(np.asarray(x[s], np.float64) for x in jax.device_get(evidence)))
     n = num_states
+    leaves, before = np.arange(n), np.append(np.arange(n), -1)
     return TreeEvidence(
         host.transitions[:, :n, :n],
-        host.symbols[:n, :n],
-        host.returns[:n, :n],
-        host.sums[:n, :n],
+        host.symbols[before][:, leaves],
+        host.returns[before][:, leaves],
+        host.sums[before][:, leaves],
         np.maximum.accumulate(host.edges),
     )

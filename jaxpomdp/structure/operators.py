@@ -18,7 +18,7 @@ from jaxpomdp.structure.significance import two_sample
 from jaxpomdp.structure.spec import Channel, safe_log
 from jaxpomdp.structure.tree import TreeSpec, name_of
 from jaxpomdp.structure.tree_edits import branch_leaves, clone_branch, new_level, with_returns
-from jaxpomdp.structure.tree_evidence import TreeEvidence, conditioned, mean_and_var
+from jaxpomdp.structure.tree_evidence import TreeEvidence, conditioned, effective, mean_and_var
 from jaxpomdp.structure.tree_tests import Conditions, Finding, TreeSplitConfig, conditions_of, findings
 
 
@@ -175,7 +175,7 @@ def _given_shares(
     """
     shares = np.full(len(conditions.nodes), 0.5)
     if finding.action >= 0:
-        hist = conditioned(evidence.returns[:, :, finding.action], finding.leaf, conditions.groups)
+        hist = effective(evidence.returns[:, :, finding.action], finding.leaf, conditions.groups)
         left, right = (hist[conditions.nodes == node] for node in (finding.left, finding.right))
         like = [two_sample(hist, np.broadcast_to(h, hist.shape)).p_value for h in (left, right)]
         total = like[0] + like[1]
@@ -188,7 +188,7 @@ def _given_shares(
 
 
 def _of_pair(conditions: Conditions, finding: Finding) -> np.ndarray:
-    """Return ``[2, N]``: the groups of the two conditions."""
+    """Return ``[2, N+1]``: the groups of the two conditions."""
     return np.concatenate([conditions.groups[conditions.nodes == n] for n in (finding.left, finding.right)])
 
 
@@ -257,7 +257,9 @@ BROTHER_SPLIT = _operator("brother")
 UNCLE_SPLIT = _operator("uncle")
 """The branch of a leaf whose return depends on which uncle was active before is copied whole (6.3.3)."""
 PARENT_SPLIT = _operator("parent")
-"""Where a leaf's return depends on who activated its parent, a level is added below the parent (6.3.4)."""
+"""Where a leaf's return depends on who activated its parent, a level is added below the parent (6.3.4).
+
+The root is activated by a trial's start, and by itself where a transition could be a starting over."""
 
 _OPERATORS = (OBSERVATION_SPLIT, BROTHER_SPLIT, UNCLE_SPLIT, PARENT_SPLIT)
 TREE_SPLITS = tuple((operator, DEFAULTS) for operator in _OPERATORS)

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxpomdp.structure.spec import safe_log
 from jaxpomdp.structure.tree import TreeSpec, allowed_horizontal, allowed_vertical
-from jaxpomdp.structure.tree_forms import maximal, minimal
+from jaxpomdp.structure.tree_forms import closed, opened
 from jaxpomdp.structure.tree_growth import Growth, Shape, branch_copied, level_added
 
 
@@ -58,24 +58,25 @@ def new_level(spec: TreeSpec, node: int, strong: float) -> TreeSpec:
 
     The new child is activated with probability ``strong``, the others share the rest (thesis 6.3.4). Done in
     maximal self-referential form, where the new state ends whenever a child of it does and the node starts
-    over, so the model is the same.
+    over, so the model is the same. The root, which never ends, starts over with certainty (``opened``).
 
     Raises:
-        ValueError: the node is no internal state below the root.
+        ValueError: the node is no internal state.
     """
-    if not spec.root < node < spec.num_nodes:
-        raise ValueError(f"node must be an internal state below the root, got {node}")
-    most = maximal(spec)
+    if not spec.root <= node < spec.num_nodes:
+        raise ValueError(f"node must be an internal state, got {node}")
+    most = opened(spec)
     number = node - spec.root
     copied = level_added(shape_of(most), node)
     vertical, horizontal, _ = _read(most, copied)
-    leaves = len(copied.leaf_origin)
-    new = leaves + spec.num_internal
+    new = len(copied.leaf_origin) + spec.num_internal
     horizontal[:, new] = 0
     horizontal[:, new, -1] = 1
+    if node == spec.root:
+        vertical[:, spec.num_internal] = vertical[-1, spec.num_internal]
     vertical[:, number] *= 1 - strong
-    vertical[:, number, new] = strong
-    return minimal(_grown(most, copied, vertical, horizontal))
+    vertical[-1 if node == spec.root else slice(None), number, new] = strong
+    return closed(_grown(most, copied, vertical, horizontal))
 
 
 def _twins(spec: TreeSpec, copied: Growth, node: int) -> tuple[int, int]:
@@ -94,11 +95,9 @@ def _read(spec: TreeSpec, copied: Growth) -> tuple[np.ndarray, np.ndarray, np.nd
     vertical = np.exp(spec.log_vertical.astype(float))[:, copied.node_origin][:, :, origin]
     horizontal = np.exp(spec.log_horizontal.astype(float))[:, origin][:, :, columns]
     shape = _grown(spec, copied, vertical, horizontal)
-    return (
-        vertical * allowed_vertical(shape),
-        horizontal * allowed_horizontal(shape, self_referential=True),
-        origin,
-    )
+    places = allowed_horizontal(shape, self_referential=True)
+    places[:, -1] |= shape.parent == shape.root
+    return vertical * allowed_vertical(shape), horizontal * places, origin
 
 
 def _grown(spec: TreeSpec, copied: Growth, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
