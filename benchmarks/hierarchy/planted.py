@@ -136,15 +136,15 @@ def _before(states: np.ndarray, spec: TreeSpec) -> np.ndarray:
     return np.concatenate([np.full((len(states), 1), spec.num_states), states[:, :-1]], axis=1)
 
 
-def known(spec: TreeSpec, tape: Tape) -> TreeEvidence:
-    """Gather the evidence with the states known."""
+def known(spec: TreeSpec, tape: Tape, symbols: int | None = None) -> TreeEvidence:
+    """Gather the evidence with the states known, of so many symbols (by default the first channel's)."""
     n = spec.num_states
     states, before = tape.states.ravel(), _before(tape.states, spec).ravel()
     pairs = np.zeros((len(states), n + 1, n))
     pairs[np.arange(len(states)), before, states] = 1
     edges = even_edges(tape.returns.min(), tape.returns.max(), BINS)
     columns = tape.actions.ravel(), tape.symbols.ravel(), tape.returns.ravel()
-    count = spec.emissions[0].values["log_prob"].shape[1]
+    count = spec.emissions[0].values["log_prob"].shape[1] if symbols is None else symbols
     return tree_evidence(pairs, *columns, edges, num_actions=ACTIONS, num_symbols=count)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -44,7 +46,8 @@ def gather_tree_evidence(
         family: the kind of model.
         params: parameters with leading ``S``.
         batch: tapes.
-        symbols: int ``[S, B, T]``, what counts as the observation (symbols, or bins of numbers).
+        symbols: int ``[S, B, T]``, what counts as the observation: symbols, bins of numbers, or combinations
+            of several channels' symbols (``joint_symbols``).
         config: theta and the plan; with theta returns are part of the posterior.
         num_symbols: O.
         bins: of the returns.
@@ -54,6 +57,21 @@ def gather_tree_evidence(
     over = partial(_of_model, num_symbols=num_symbols, bins=bins)
     found = jax.vmap(over)(chains, log_obs, smoothed.gamma, batch, symbols)
     return TreeEvidence(smoothed.xi, *found)
+
+
+def joint_symbols(observations: Sequence[Array], sizes: Sequence[int]) -> tuple[Array, int]:
+    """Return one symbol for what was seen in several channels of symbols together, and how many there are.
+
+    The first channel is the most significant digit, as the observation split expects.
+
+    >>> symbols, count = joint_symbols((jnp.array([0, 1]), jnp.array([2, 0])), (2, 3))
+    >>> symbols.tolist(), count
+    ([2, 3], 6)
+    """
+    joint = jnp.zeros_like(observations[0])
+    for seen, size in zip(observations, sizes, strict=True):
+        joint = joint * size + seen
+    return joint, math.prod(sizes)
 
 
 def _of_model(

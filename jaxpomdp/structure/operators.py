@@ -32,7 +32,7 @@ class TreeSplit(NamedTuple):
         leaf_shares: ``[N]``, share of the transition from each leaf that goes to the copy.
         node_shares: ``[I]``, of that from each internal state.
         entry_share: of the entry from the parent.
-        symbols: ``[2, O]``, observations of the leaf and its copy; None: copied.
+        symbols: ``[2, O]``, observations of the leaf and its copy (of several channels together); None: copied.
         returns: ``[2, 2]``, mean and variance of the return of the leaf and its copy; None: copied.
         strong: share of the new level.
     """
@@ -223,15 +223,36 @@ def _shares(spec: TreeSpec, split: TreeSplit) -> np.ndarray:
 
 def _told_apart(spec: TreeSpec, split: TreeSplit, pair: Sequence[int]) -> TreeSpec:
     """Give the leaf and its copy what was found after the one condition and after the other."""
-    if split.symbols is not None and spec.emissions and spec.emissions[0].kind == "Categorical":
-        table = spec.emissions[0].values["log_prob"].copy()
-        table[list(pair)] = safe_log(split.symbols)
-        spec = replace(spec, emissions=(Channel("Categorical", {"log_prob": table}), *spec.emissions[1:]))
+    if split.symbols is not None:
+        spec = replace(spec, emissions=_with_symbols(spec.emissions, split.symbols, list(pair)))
     if split.returns is not None:
         column = split.action if spec.return_mean.shape[1] > 1 else 0
         for leaf, (mean, var) in zip(pair, split.returns, strict=True):
             spec = with_returns(spec, leaf, column, float(mean), float(var))
     return spec
+
+
+def _with_symbols(channels: tuple[Channel, ...], symbols: np.ndarray, pair: list[int]) -> tuple[Channel, ...]:
+    """Give the two leaves of a pair new rows in the channels that the symbols ``[2, O]`` code.
+
+    Symbols number what was seen in one or more channels together, the first the most significant digit
+    (``agents.tree_evidence.joint_symbols``). They code the first categorical channels, as many as have O
+    combinations, and each gets its marginal distribution. Other channels, and all where none fit (symbols
+    that are bins of numbers), keep the copied rows.
+    """
+    places = [c for c, channel in enumerate(channels) if channel.kind == "Categorical"]
+    sizes = [channels[c].values["log_prob"].shape[1] for c in places]
+    fits = [k for k in range(1, len(sizes) + 1) if np.prod(sizes[:k]) == symbols.shape[1]]
+    if not fits:
+        return channels
+    coded, told = sizes[: fits[0]], list(channels)
+    joint = symbols.reshape(2, *coded)
+    for k, place in enumerate(places[: len(coded)]):
+        others = tuple(1 + axis for axis in range(len(coded)) if axis != k)
+        table = channels[place].values["log_prob"].copy()
+        table[pair] = safe_log(joint.sum(others))
+        told[place] = Channel("Categorical", {"log_prob": table})
+    return tuple(told)
 
 
 def _one_per_top(edits: list[Edit]) -> list[Edit]:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks.hierarchy.planted import KINDS, simulate, world
+from benchmarks.hierarchy.planted import KINDS, draw, known, simulate, world
 from jaxpomdp.structure.edits import Allowance
 from jaxpomdp.structure.operators import TREE_SPLITS, propose
 from jaxpomdp.structure.policy import PolicyConfig, revise
 from jaxpomdp.structure.significance import two_sample
-from jaxpomdp.structure.tree import validate_tree
+from jaxpomdp.structure.spec import Channel
+from jaxpomdp.structure.tree import TreeSpec, validate_tree
 from jaxpomdp.structure.tree_evidence import conditioned, effective
 from jaxpomdp.structure.tree_forms import starting_over
 from jaxpomdp.structure.tree_tests import TreeSplitConfig, activations, brothers, uncles
@@ -171,3 +173,50 @@ def test_allowances_and_wrong_arguments() -> None:
         OPERATORS["uncle"].apply(thesis_tree(), edits[0])
     with pytest.raises(ValueError, match="strong must be between 0 and 1"):
         TreeSplitConfig(strong=1.5)
+
+
+def of_two_channels(spec: TreeSpec, second: int) -> TreeSpec:
+    """The second channel says nothing at first: even rows."""
+    even = Channel("Categorical", {"log_prob": np.full((spec.num_states, second), -np.log(second))})
+    number = Channel("DiagonalGaussian", {"mean": np.zeros((spec.num_states, 1))})
+    return replace(spec, emissions=(number, *spec.emissions, even))
+
+
+def test_every_channel_that_symbols_code_is_told_apart() -> None:
+    """Planted in the second channel; the first, which does not depend on what was before, stays as it is."""
+    spec, leaf = world(0), 4
+    tape = draw(spec, 0, 20_000)
+    rng = np.random.default_rng(1)
+    after = np.concatenate([np.full((len(tape.states), 1), 9), tape.states[:, :-1]], 1)
+    brother = int(brothers(spec, leaf).nodes[0])
+    marked = (tape.states == leaf) & (after == brother)
+    second = np.where(marked & (rng.uniform(size=marked.shape) < 0.6), 2, rng.integers(3, size=marked.shape))
+    both = of_two_channels(spec, 3)
+    evidence = known(spec, tape._replace(symbols=tape.symbols * 3 + second), symbols=12)
+    edit = propose("observation", both, evidence)[0]
+    assert (edit.node, f"s{brother}" in edit.details.conditions) == (leaf, True)
+    grown = OPERATORS["observation"].apply(both, edit)
+    validate_tree(grown)
+    first, other = (np.exp(c.values["log_prob"]) for c in grown.emissions[1:])
+    fitting = other[[leaf, 9]][:, 2].argmax()
+    assert other[[leaf, 9][fitting], 2] == pytest.approx(0.6 + 0.4 / 3, abs=0.1)
+    np.testing.assert_allclose(
+        first[[leaf, 9]], np.exp(spec.emissions[0].values["log_prob"])[[leaf] * 2], atol=0.1
+    )
+    np.testing.assert_array_equal(other[:leaf], np.full((leaf, 3), 1 / 3))
+
+
+def test_symbols_of_the_first_channel_leave_the_second_and_bins_leave_all() -> None:
+    spec = world(0)
+    both = of_two_channels(spec, 3)
+    edit = eager(0, "observation")[1][0]
+    grown = OPERATORS["observation"].apply(both, edit)
+    assert (
+        grown.emissions[1].values["log_prob"][edit.node] != both.emissions[1].values["log_prob"][edit.node]
+    ).any()
+    np.testing.assert_array_equal(grown.emissions[2].values["log_prob"], np.full((10, 3), -np.log(3)))
+    bins = edit.details._replace(symbols=np.full((2, 7), 1 / 7))
+    grown = OPERATORS["observation"].apply(both, replace(edit, details=bins))
+    np.testing.assert_array_equal(
+        grown.emissions[1].values["log_prob"][9], both.emissions[1].values["log_prob"][edit.node]
+    )
