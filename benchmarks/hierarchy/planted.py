@@ -18,6 +18,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,14 +32,22 @@ from jaxpomdp.experiments.record import versions
 from jaxpomdp.models.em import EMConfig, em_step
 from jaxpomdp.models.hierarchical import HIERARCHICAL
 from jaxpomdp.packing import pack
-from jaxpomdp.structure.evidence import even_edges
+from jaxpomdp.structure.evidence import bin_of, even_edges
 from jaxpomdp.structure.operators import propose
+from jaxpomdp.structure.significance import two_sample
 from jaxpomdp.structure.spec import Channel
 from jaxpomdp.structure.tree import TreeSpec
 from jaxpomdp.structure.tree_evidence import TreeEvidence, tree_evidence
 from jaxpomdp.structure.tree_forms import flatten_tree, starting_over
 from jaxpomdp.structure.tree_init import random_tree
-from jaxpomdp.structure.tree_tests import Conditions, TreeSplitConfig, activations, brothers, uncles
+from jaxpomdp.structure.tree_tests import (
+    Conditions,
+    TreeSplitConfig,
+    activations,
+    brothers,
+    conditions_of,
+    uncles,
+)
 
 KINDS = ("observation", "brother", "uncle", "parent")
 SYMBOLS, ACTIONS, BINS = 4, 2, 12
@@ -53,12 +62,13 @@ RESULT = Path(__file__).parents[1] / "results" / "hierarchy" / "operators.json"
 
 
 class Tape(NamedTuple):
-    """Trials of one length, ``[B, L]``, with the leaves that made them."""
+    """Trials of one length, ``[B, L]``, with the leaves that made them and where the plant is."""
 
     states: np.ndarray
     actions: np.ndarray
     symbols: np.ndarray
     returns: np.ndarray
+    marked: np.ndarray
 
 
 def world(seed: int, symbols: str = "vague", *, levels: int = 2) -> TreeSpec:
@@ -111,13 +121,14 @@ def draw(
     table = np.exp(spec.emissions[0].values["log_prob"])
     symbols = (table[states].cumsum(-1) > rng.uniform(size=(*states.shape, 1))).argmax(-1)
     returns = spec.return_mean[states, 0] + rng.normal(size=states.shape)
+    marked = np.zeros(states.shape, bool)
     if plant is not None:
         chance = conditions_for(plant, spec, leaf).groups[group].astype(float)[_before(states, spec)]
         marked = (rng.uniform(size=states.shape) < chance) & (states == leaf)
         moved = marked & (rng.uniform(size=states.shape) < 0.5 * shift) & (plant == "observation")
         symbols[moved] = table[leaf].argmin()
         returns[marked & (actions == 0) & (plant != "observation")] += shift
-    return Tape(states, actions, symbols, returns)
+    return Tape(states, actions, symbols, returns, marked)
 
 
 def _paths(rng: np.random.Generator, init: np.ndarray, trans: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -168,7 +179,7 @@ def smoothed(
 
 
 def _batch(tapes: Sequence[Tape]) -> TrialBatch:
-    _, actions, symbols, returns = (np.stack(x) for x in zip(*tapes, strict=True))
+    _, actions, symbols, returns, _ = (np.stack(x) for x in zip(*tapes, strict=True))
     there, first = np.ones(actions.shape, bool), np.zeros(actions.shape, bool)
     first[..., 0] = True
     returns = jnp.asarray(returns, jnp.float32)
@@ -223,6 +234,45 @@ def measure(case: tuple[str, str, str, float], options: argparse.Namespace) -> d
     return rows
 
 
+def told(spec: TreeSpec, tape: Tape, leaf: int, level: float) -> bool:
+    """Say whether the parent split's test would fire if it were seen when the parent started over.
+
+    It is the most that can be asked of it: its evidence is the share of each transition that is a starting
+    over, and the test is then diluted by the rest.
+    """
+    entered = ~spec.below[spec.parent[leaf]]
+    entry = (tape.states == leaf) & np.append(entered, True)[_before(tape.states, spec)]
+    edges = even_edges(tape.returns.min(), tape.returns.max(), BINS)
+    groups = [tape.returns[group & (tape.actions == 0)] for group in (tape.marked, entry)]
+    own, other = (np.bincount(bin_of(x, edges), minlength=BINS).astype(float) for x in groups)
+    tests = spec.num_states * ACTIONS
+    weight = min(own.sum(), other.sum())
+    return bool(weight >= 30 and two_sample(own, other).p_value * tests < level)
+
+
+def by_share(options: argparse.Namespace) -> list[dict[str, float]]:
+    """Return the parent split's power with known states by how much of what it weighs is a starting over."""
+    config, rows = TreeSplitConfig(significance=options.level), []
+    for seed in range(options.runs):
+        spec = world(seed)
+        leaf = int(np.random.default_rng(seed).integers(spec.num_states))
+        tape = draw(spec, seed, options.steps, "parent", leaf)
+        evidence = known(spec, tape)
+        groups = conditions_of("parent", spec, evidence, np.arange(spec.num_states) == leaf)[leaf].groups
+        weight = evidence.returns[:, leaf].sum((-1, -2))
+        own = groups[0] @ weight
+        share = (groups[0] ** 2 @ weight) / own if own > 0 else 0.0
+        fired = any(edit.node == leaf for edit in propose("parent", spec, evidence, config))
+        rows.append((share, fired, told(spec, tape, leaf, options.level)))
+    found, limits = np.array(rows, float), (0, 0.1, 0.3, 0.5, 1.01)
+    parts = [found[(found[:, 0] >= low) & (found[:, 0] < high)] for low, high in pairwise(limits)]
+    return [
+        {"share": f"{low} to {min(high, 1)}", "runs": len(part)}
+        | {name: float(part[:, k].mean()) if len(part) else 0.0 for k, name in ((1, "power"), (2, "told"))}
+        for part, (low, high) in zip(parts, pairwise(limits), strict=True)
+    ]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
@@ -232,6 +282,7 @@ def main() -> None:
     cases = {case[0]: measure(case, options) for case in CASES}
     command = " ".join(["python -m benchmarks.hierarchy.planted", *sys.argv[1:]])
     result = {"command": command, "versions": versions()} | vars(options) | {"cases": cases}
+    result["parent split by the share that is a starting over"] = by_share(options)
     RESULT.parent.mkdir(parents=True, exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=1) + "\n")
 

@@ -32,7 +32,7 @@ class TreeSplit(NamedTuple):
         leaf_shares: ``[N]``, share of the transition from each leaf that goes to the copy.
         node_shares: ``[I]``, of that from each internal state.
         entry_share: of the entry from the parent.
-        symbols: ``[2, O]``, observations (of several channels: jointly) of the leaf and its copy; None: copied.
+        symbols: ``[2, O]``, observations of the leaf and its copy, channels jointly; None: copied.
         returns: ``[2, 2]``, mean and variance of the return of the leaf and its copy; None: copied.
         strong: share of the new level.
     """

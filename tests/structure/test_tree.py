@@ -269,3 +269,11 @@ def test_opening_a_tree_of_one_level_finds_its_restarts() -> None:
     spec = one_level(FlatSpec.from_probabilities(start, rows[None], (np.eye(3),)))
     np.testing.assert_allclose(np.exp(opened(spec).log_horizontal[0, :3, -1]), 1 / 3)
     np.testing.assert_allclose(starting_over(spec)[0], start / 3 / rows)
+
+
+def test_a_random_tree_may_be_of_a_given_shape() -> None:
+    spec = random_tree(0, 5, 2, 3, shape=[0, [1, [2, 3]], 4])
+    validate_tree(spec)
+    assert spec.leaf_parent.tolist() == [0, 1, 2, 2, 0]
+    with pytest.raises(ValueError, match="shape must hold 6 leaves, got 5"):
+        random_tree(0, 6, 2, 3, shape=[0, [1, [2, 3]], 4])
