@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -51,14 +51,28 @@ from jaxpomdp.structure.tree_tests import (
 
 KINDS = ("observation", "brother", "uncle", "parent")
 SYMBOLS, ACTIONS, BINS = 4, 2, 12
-CASES = (
-    ("known states, vague symbols", "known", "vague", 0.0),
-    ("smoothed by the true model, clear symbols", "smoothed", "clear", 0.0),
-    ("smoothed with returns (theta .2), clear symbols", "smoothed", "clear", 0.2),
-    ("smoothed by the true model, vague symbols", "smoothed", "vague", 0.0),
-    ("smoothed after EM, clear symbols", "fitted", "clear", 0.0),
-)
 RESULT = Path(__file__).parents[1] / "results" / "hierarchy" / "operators.json"
+
+
+class Case(NamedTuple):
+    """Where evidence comes from, how clear symbols are, theta, how far apart the returns of leaves are."""
+
+    evidence: str = "smoothed"
+    symbols: str = "clear"
+    theta: float = 0.0
+    apart: float = 0.1
+    roots: bool = False
+
+
+CASES = {
+    "known states, vague symbols": Case("known", "vague", roots=True),
+    "smoothed by the true model, clear symbols": Case(roots=True),
+    "smoothed by the true model, vague symbols": Case(symbols="vague"),
+    "smoothed after EM, clear symbols": Case("fitted"),
+    "smoothed, leaves one deviation apart": Case(apart=1.0),
+    "smoothed with theta .2, one deviation apart": Case(theta=0.2, apart=1.0),
+    "smoothed with theta 1, one deviation apart": Case(theta=1.0, apart=1.0),
+}
 
 
 class Tape(NamedTuple):
@@ -71,23 +85,28 @@ class Tape(NamedTuple):
     marked: np.ndarray
 
 
-def world(seed: int, symbols: str = "vague", *, levels: int = 2) -> TreeSpec:
-    """Draw a tree of three branches of three leaves each, or (one level) of five leaves."""
-    if levels == 1:
-        return _seen(random_tree(seed, 5, ACTIONS, SYMBOLS, levels=1, concentration=2.0), symbols)
-    while True:
-        spec = random_tree(seed, 9, ACTIONS, SYMBOLS, levels=2, form="sober", concentration=2.0)
-        if spec.num_internal == 4:
-            return _seen(spec, symbols)
-        seed += 1
+def world(seed: int, symbols: str = "vague", apart: float = 0.1, *, levels: int = 2) -> TreeSpec:
+    """Draw a tree of three branches of three leaves each, or (one level) of five leaves.
 
-
-def _seen(spec: TreeSpec, symbols: str) -> TreeSpec:
+    Mean returns of leaves are ``apart``, in standard deviations of the return in one leaf.
+    """
+    spec = _tree(seed, levels)
+    spec = replace(spec, return_mean=spec.return_mean * apart / 0.1)
     if symbols == "vague":
         return spec
     n = spec.num_states
     table = np.full((n, n), 0.2 / (n - 1)) + (0.8 - 0.2 / (n - 1)) * np.eye(n)
     return replace(spec, emissions=(Channel("Categorical", {"log_prob": np.log(table)}),))
+
+
+def _tree(seed: int, levels: int) -> TreeSpec:
+    if levels == 1:
+        return random_tree(seed, 5, ACTIONS, SYMBOLS, levels=1, concentration=2.0)
+    while True:
+        spec = random_tree(seed, 9, ACTIONS, SYMBOLS, levels=2, form="sober", concentration=2.0)
+        if spec.num_internal == 4:
+            return spec
+        seed += 1
 
 
 def conditions_for(kind: str, spec: TreeSpec, leaf: int) -> Conditions:
@@ -203,35 +222,46 @@ def gathered(evidence: str, specs: list[TreeSpec], tapes: list[Tape], theta: flo
     return smoothed(specs, tapes, theta, iterations=20 if evidence == "fitted" else 0)
 
 
-def measure(case: tuple[str, str, str, float], options: argparse.Namespace) -> dict[str, dict[str, float]]:
+def measure(name: str, case: Case, options: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Return power and size of every operator in one case; the parent split also below the root."""
-    _, evidence, symbols, theta = case
-    runs, config = range(options.runs), TreeSplitConfig(significance=options.level)
     rows: dict[str, dict[str, float]] = {}
-    for name, levels, group, length in (("", 2, 0, 50), ("", 1, 0, 10), (", at the start", 1, 1, 10)):
-        specs = [world(seed, symbols, levels=levels) for seed in runs]
-        leaves = [
-            int(np.random.default_rng(seed).integers(spec.num_states)) for seed, spec in enumerate(specs)
-        ]
-        data = {"steps": options.steps, "length": length}
-        none = [draw(spec, seed + options.runs, **data) for seed, spec in enumerate(specs)]
-        quiet = gathered(evidence, specs, none, theta)
-        for kind in KINDS if levels > 1 else ("parent",):
-            plants = zip(specs, leaves, strict=True)
-            tapes = [
-                draw(spec, seed, plant=kind, leaf=leaf, group=group, **data)
-                for seed, (spec, leaf) in enumerate(plants)
-            ]
-            planted = gathered(evidence, specs, tapes, theta)
-            found = [
-                any(edit.node == leaf for edit in propose(kind, spec, seen, config))
-                for spec, leaf, seen in zip(specs, leaves, planted, strict=True)
-            ]
-            fired = [bool(propose(kind, *pair, config)) for pair in zip(specs, quiet, strict=True)]
-            label = kind if levels > 1 else f"{kind}, one level{name}"
-            rows[label] = {"power": float(np.mean(found)), "size": float(np.mean(fired))}
-            print(case[0], label, rows[label], flush=True)
+    for kind, found, fired in _fires(case, options, KINDS, levels=2, length=50):
+        rows[kind] = {"power": found, "size": fired}
+    for group, where in enumerate(("", ", at the start") if case.roots else ()):
+        for kind, found, fired in _fires(case, options, ("parent",), levels=1, length=10, group=group):
+            rows[f"{kind}, one level{where}"] = {"power": found, "size": fired}
+    print(name, json.dumps(rows, indent=1), flush=True)
     return rows
+
+
+def _fires(
+    case: Case,
+    options: argparse.Namespace,
+    kinds: Sequence[str],
+    *,
+    levels: int,
+    length: int,
+    group: int = 0,
+) -> Iterator[tuple[str, float, float]]:
+    """Give for each operator how often it finds the plant, and how often it fires without one."""
+    runs, config = range(options.runs), TreeSplitConfig(significance=options.level)
+    specs = [world(seed, case.symbols, case.apart, levels=levels) for seed in runs]
+    leaves = [int(np.random.default_rng(seed).integers(specs[0].num_states)) for seed in runs]
+    data = {"steps": options.steps, "length": length}
+    none = [draw(spec, seed + options.runs, **data) for seed, spec in enumerate(specs)]
+    quiet = gathered(case.evidence, specs, none, case.theta)
+    for kind in kinds:
+        tapes = [
+            draw(spec, seed, plant=kind, leaf=leaf, group=group, **data)
+            for seed, (spec, leaf) in enumerate(zip(specs, leaves, strict=True))
+        ]
+        planted = gathered(case.evidence, specs, tapes, case.theta)
+        found = [
+            any(edit.node == leaf for edit in propose(kind, spec, seen, config))
+            for spec, leaf, seen in zip(specs, leaves, planted, strict=True)
+        ]
+        fired = [bool(propose(kind, *pair, config)) for pair in zip(specs, quiet, strict=True)]
+        yield kind, float(np.mean(found)), float(np.mean(fired))
 
 
 def told(spec: TreeSpec, tape: Tape, leaf: int, level: float) -> bool:
@@ -279,7 +309,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--level", type=float, default=0.05)
     options = parser.parse_args()
-    cases = {case[0]: measure(case, options) for case in CASES}
+    cases = {name: measure(name, case, options) for name, case in CASES.items()}
     command = " ".join(["python -m benchmarks.hierarchy.planted", *sys.argv[1:]])
     result = {"command": command, "versions": versions()} | vars(options) | {"cases": cases}
     result["parent split by the share that is a starting over"] = by_share(options)
