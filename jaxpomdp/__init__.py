@@ -60,6 +60,9 @@ if TYPE_CHECKING:
     from jaxpomdp.experiments.results import RunData as RunData
     from jaxpomdp.experiments.results import load_run as load_run
     from jaxpomdp.experiments.runner import run as run
+    from jaxpomdp.experiments.tree_animation import growth_animation as growth_animation
+    from jaxpomdp.experiments.tree_animation import tree_belief_animation as tree_belief_animation
+    from jaxpomdp.experiments.tree_drawing import tree_picture as tree_picture
     from jaxpomdp.kernels.decoding import Decoded as Decoded
     from jaxpomdp.kernels.decoding import viterbi as viterbi
     from jaxpomdp.kernels.filtering import Filtered as Filtered
@@ -197,6 +200,7 @@ _HOMES = {
     "flatten_tree": "jaxpomdp.structure.tree_forms",
     "from_pomdp": "jaxpomdp.envs.pomdp_world",
     "gather_tree_evidence": "jaxpomdp.agents.tree_evidence",
+    "growth_animation": "jaxpomdp.experiments.tree_animation",
     "hallway": "jaxpomdp.envs.hallway",
     "hallway_navigation": "jaxpomdp.envs.hallway",
     "heading_maze": "jaxpomdp.envs.maze89",
@@ -244,7 +248,9 @@ _HOMES = {
     "tiger_grid": "jaxpomdp.envs.maze89",
     "tmaze": "jaxpomdp.envs.tmaze",
     "to_pomdp": "jaxpomdp.envs.pomdp_world",
+    "tree_belief_animation": "jaxpomdp.experiments.tree_animation",
     "tree_over": "jaxpomdp.structure.tree_init",
+    "tree_picture": "jaxpomdp.experiments.tree_drawing",
     "trial_batch": "jaxpomdp.models.data",
     "unpack": "jaxpomdp.packing",
     "unpack_coupled": "jaxpomdp.coupled_packing",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -11,7 +13,7 @@ import numpy as np
 
 from jaxpomdp._types import Array, TrialBatch
 from jaxpomdp.agents.learner import filter_chains
-from jaxpomdp.kernels.filtering import EXACT, linked_steps
+from jaxpomdp.kernels.filtering import EXACT, trial_starts
 from jaxpomdp.models.em import EMConfig, e_step
 from jaxpomdp.models.family import Family
 from jaxpomdp.structure.tree_evidence import TreeEvidence
@@ -38,13 +40,15 @@ def gather_tree_evidence(
     """Gather ``TreeEvidence`` of ``S`` models on their tapes ``[S, B, T]``: arrays with leading ``S``.
 
     The weight of leaf k before and l now is the smoothed ``xi_t(k, l) = b_{t-1}(k) T_a(k, l) gamma_t(l) /
-    predicted_t(l)``. Bins are even between the least and the largest modelled return of each model's tapes.
+    predicted_t(l)``, that of a start before l ``gamma_t(l)``. Bins are even between the least and the largest
+    modelled return of each model's tapes.
 
     Args:
         family: the kind of model.
         params: parameters with leading ``S``.
         batch: tapes.
-        symbols: int ``[S, B, T]``, what counts as the observation (symbols, or bins of numbers).
+        symbols: int ``[S, B, T]``, what counts as the observation: symbols, bins of numbers, or combinations
+            of several channels' symbols (``joint_symbols``).
         config: theta and the plan; with theta returns are part of the posterior.
         num_symbols: O.
         bins: of the returns.
@@ -57,6 +61,21 @@ def gather_tree_evidence(
     return TreeEvidence(smoothed.xi, *jax.lax.map(lambda model: over(*model), models))
 
 
+def joint_symbols(observations: Sequence[Array], sizes: Sequence[int]) -> tuple[Array, int]:
+    """Return one symbol for what was seen in several channels of symbols together, and how many there are.
+
+    The first channel is the most significant digit, as the observation split expects.
+
+    >>> symbols, count = joint_symbols((jnp.array([0, 1]), jnp.array([2, 0])), (2, 3))
+    >>> symbols.tolist(), count
+    ([2, 3], 6)
+    """
+    joint = jnp.zeros_like(observations[0])
+    for seen, size in zip(observations, sizes, strict=True):
+        joint = joint * size + seen
+    return joint, math.prod(sizes)
+
+
 def _of_model(
     trans: Array,
     belief: Array,
@@ -66,7 +85,7 @@ def _of_model(
     num_symbols: int,
     bins: int,
 ) -> tuple[Array, ...]:
-    linked = jax.vmap(linked_steps)(batch.start, batch.valid)
+    first = trial_starts(batch.start, batch.valid)
     counted = batch.has_return & batch.valid
     edges = _edges(batch.returns, counted, bins)
     actions = trans.shape[0]
@@ -76,17 +95,25 @@ def _of_model(
         jnp.where(counted, batch.actions * bins + place, -1),
         jnp.where(counted, batch.returns, 0),
     )
-    before = jnp.where(linked[..., None], belief, 0)
-    steps = _Steps(trans, *(_rows(x) for x in (_shifted(before), gamma, _shifted(batch.actions))))
+    before = _before(belief, first, batch.valid)
+    ways = jnp.concatenate([trans, jnp.ones_like(trans[:, :1])], axis=1)
+    steps = _Steps(ways, _rows(before), _rows(gamma), _rows(jnp.roll(batch.actions, 1, axis=1)))
     symbol, outcome, value = (_rows(x) for x in cells)
     one = jnp.ones_like(value)
     seen = sums_by_cell(steps, symbol, one[:, None], num_symbols)[0]
     powers = jnp.stack([one, value, value**2], axis=-1)
     outcomes = sums_by_cell(steps, outcome, powers, actions * bins)
     n = gamma.shape[-1]
-    tables = jnp.moveaxis(outcomes, (2, 3), (0, 1)).reshape(n, n, 3, actions, bins)
+    tables = jnp.moveaxis(outcomes, (2, 3), (0, 1)).reshape(n + 1, n, 3, actions, bins)
     moments = jnp.moveaxis(jnp.sum(tables[:, :, 1:], axis=-1), 2, -1)
     return jnp.moveaxis(seen, 0, -1), tables[:, :, 0], moments, edges
+
+
+def _before(belief: Array, first: Array, valid: Array) -> Array:
+    """Return ``[B, T, N+1]``: the belief of the step before; one in the last place where a trial begins."""
+    linked = valid & ~first
+    leaves = jnp.where(linked[..., None], jnp.roll(belief, 1, axis=1), 0)
+    return jnp.concatenate([leaves, first[..., None].astype(belief.dtype)], axis=-1)
 
 
 def _edges(returns: Array, counted: Array, bins: int) -> Array:
@@ -98,11 +125,11 @@ def _edges(returns: Array, counted: Array, bins: int) -> Array:
 
 
 class _Steps(NamedTuple):
-    """All steps of a model's tapes laid end to end: ``trans[A, N, N]``, the belief one step before
-    ``before[P, N]`` (zero at starts), smoothed ``now[P, N]``, and the action in between ``action[P]``.
+    """All steps of a model's tapes end to end: ``before[P, N+1]`` (see ``_before``), smoothed ``now[P, N]``
+    and the action in between ``action[P]``; ``ways[A, N+1, N]`` are transitions, and ones where trials begin.
     """
 
-    trans: Array
+    ways: Array
     before: Array
     now: Array
     action: Array
@@ -113,7 +140,7 @@ BLOCK = 32
 
 
 def sums_by_cell(steps: _Steps, cell: Array, weights: Array, cells: int) -> Array:
-    """Return ``sum_t w_t[k] xi_t(i, j)`` over the steps of each cell, ``[K, cells, N, N]``.
+    """Return ``sum_t w_t[k] xi_t(i, j)`` over the steps of each cell, ``[K, cells, N+1, N]``.
 
     Steps are sorted by cell and action and cut into blocks, so that a block costs one matrix product.
 
@@ -123,7 +150,7 @@ def sums_by_cell(steps: _Steps, cell: Array, weights: Array, cells: int) -> Arra
         weights: ``[P, K]``.
         cells: how many there are.
     """
-    actions, n = steps.trans.shape[:2]
+    actions, *pairs = steps.ways.shape
     groups = cells * actions
     group = jnp.where(cell >= 0, cell * actions + steps.action, groups)
     slots, group_of_block = _blocks(group, groups)
@@ -133,13 +160,13 @@ def sums_by_cell(steps: _Steps, cell: Array, weights: Array, cells: int) -> Arra
     def add(total: Array, block: tuple[Array, ...]) -> tuple[Array, None]:
         left, right, power, number = block
         place, action = jnp.divmod(number, actions)
-        matrix = steps.trans[action]
+        matrix = steps.ways[action]
         predicted = jnp.matmul(left, matrix, precision=EXACT)
         ratio = jnp.where(predicted > 0, right / jnp.where(predicted > 0, predicted, 1), 0)
-        pairs = jnp.einsum("bk,bi,bj->kij", power, left, ratio, precision=EXACT)
-        return total.at[place].add(pairs * matrix[None], mode="drop"), None
+        found = jnp.einsum("bk,bi,bj->kij", power, left, ratio, precision=EXACT) * matrix[None]
+        return total.at[place].add(found, mode="drop"), None
 
-    blank = jnp.zeros((cells, weights.shape[-1], n, n), steps.trans.dtype)
+    blank = jnp.zeros((cells, weights.shape[-1], *pairs), steps.ways.dtype)
     total = jax.lax.scan(add, blank, (before, now, powers, group_of_block))[0]
     return jnp.moveaxis(total, 1, 0)
 
@@ -162,10 +189,6 @@ def _blocks(group: Array, groups: int) -> tuple[Array, Array]:
     return slots.reshape(blocks, BLOCK), jnp.searchsorted(end, jnp.arange(blocks), side="right")
 
 
-def _shifted(x: Array) -> Array:
-    return jnp.roll(x, 1, axis=1)
-
-
 def _rows(x: Array) -> Array:
     return x.reshape(-1, *x.shape[2:])
 
@@ -174,10 +197,11 @@ def evidence_of_model(evidence: TreeEvidence, s: int, num_states: int) -> TreeEv
     """Return one model's evidence on the host, without spare slots."""
     host = TreeEvidence(*(np.asarray(x[s], np.float64) for x in jax.device_get(evidence)))
     n = num_states
+    leaves, before = np.arange(n), np.append(np.arange(n), -1)
     return TreeEvidence(
         host.transitions[:, :n, :n],
-        host.symbols[:n, :n],
-        host.returns[:n, :n],
-        host.sums[:n, :n],
+        host.symbols[before][:, leaves],
+        host.returns[before][:, leaves],
+        host.sums[before][:, leaves],
         np.maximum.accumulate(host.edges),
     )

@@ -146,7 +146,7 @@ class Play:
 
 @dataclass(frozen=True)
 class Show:
-    """Draw a trained agent: its belief over one trial as an animation, and its learned model as a graph.
+    """Draw a trained agent: its belief over one trial as an animation, and its model, and a tree's growth.
 
     Examples:
       jaxpomdp show runs/maze            writes runs/maze/figures/belief.gif and model.png

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -10,13 +10,12 @@ import numpy as np
 
 from jaxpomdp.envs.text import describe_observation
 from jaxpomdp.experiments.layout import spread
-from jaxpomdp.experiments.plots import COLOURS, INK, PALE, new_figure, save
+from jaxpomdp.experiments.plots import COLOURS, INK, PALE, Panel, camera, new_figure, save
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import PatchCollection
     from matplotlib.figure import Figure
-    from matplotlib.patches import Rectangle
 
     from jaxpomdp.envs.world import World
     from jaxpomdp.experiments.walk import Walk
@@ -150,7 +149,13 @@ def _action_legend(figure: Figure, world: World, actions: np.ndarray) -> None:
 
 
 def belief_animation(
-    world: World, walk: Walk, heat: np.ndarray, path: Path, *, most_frames: int = 80
+    world: World,
+    walk: Walk,
+    heat: np.ndarray,
+    path: Path,
+    *,
+    panel: Panel | None = None,
+    most_frames: int = 80,
 ) -> Path:
     """Draw a trial as an animation: where the agent is, what it sees, and where it believes to be.
 
@@ -159,46 +164,53 @@ def belief_animation(
         walk: the trial, of ``T`` observations.
         heat: ``[T, states of the world]``, the belief in terms of the world.
         path: the GIF.
+        panel: what is beside the world; by default a bar for each state of the model.
         most_frames: a longer trial is cut.
     """
     from jaxpomdp.envs.drawing import save_gif
 
-    frames = list(_belief_frames(world, walk, heat, min(len(walk.states), most_frames)))
+    beside = _bars_panel(walk.beliefs) if panel is None else panel
+    frames = list(_belief_frames(world, walk, heat, beside, min(len(walk.states), most_frames)))
     path.parent.mkdir(parents=True, exist_ok=True)
     save_gif(path, [*frames, *frames[-1:] * 8], frames_per_second=5)
     return path
 
 
-def _belief_frames(world: World, walk: Walk, heat: np.ndarray, count: int) -> Iterator[np.ndarray]:
+def _belief_frames(
+    world: World, walk: Walk, heat: np.ndarray, panel: Panel, count: int
+) -> Iterator[np.ndarray]:
     """Give the frames, uint8 ``[height, width, 3]``, all from one figure, which is laid out once."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     from jaxpomdp.envs.drawing import draw
 
-    figure, (left, right) = new_figure(9.2, 3.9, 1, 2, width_ratios=(1.5, 1))
-    figure.set_dpi(72)
-    canvas = FigureCanvasAgg(figure)
-    bars = _belief_bars(right, walk.beliefs)
+    figure, (left, right) = new_figure(5.5 + panel.width, 3.9, 1, 2, width_ratios=(5.5, panel.width))
+    update, grab = panel.draw(right), camera(figure)
     for t in range(count):
         draw(world, left, state=int(walk.states[t]), observation=int(walk.observations[t]), heat=heat[t])
-        left.set_title(_caption(world, walk, t), fontsize=10, loc="left")
-        for bar, n in bars:
-            bar.set_height(walk.beliefs[t, n])
-        canvas.draw()
-        figure.set_layout_engine("none")
-        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        left.set_title(step_caption(world, walk, t), fontsize=10, loc="left")
+        update(t)
+        yield grab()
 
 
-def _caption(world: World, walk: Walk, t: int) -> str:
+def step_caption(world: World, walk: Walk, t: int) -> str:
+    """Say what was done before a step, and what is seen."""
     did = f"step {t}: {world.action_names[walk.actions[t - 1]]}" if t else "the trial begins"
     return f"{did}\nsees {describe_observation(world, int(walk.observations[t]))}"
 
 
-def _belief_bars(ax: Axes, beliefs: np.ndarray) -> list[tuple[Rectangle, int]]:
-    """Draw a bar for each of the states that are believed in most during the trial, in a fixed order."""
+def _bars_panel(beliefs: np.ndarray) -> Panel:
+    """Return a bar for each of the states that are believed in most during the trial, in a fixed order."""
     shown = np.sort(np.argsort(-beliefs.max(axis=0), kind="stable")[:12])
-    bars = ax.bar(np.arange(len(shown)), np.zeros(len(shown)), color="#ff922b")
-    ax.set(ylim=(0, 1), xlabel="states of the learned model", ylabel="belief")
-    ax.set_xticks(range(len(shown)), [str(n) for n in shown], fontsize=6.5)
-    ax.grid(visible=False, axis="x")
-    return list(zip(bars, shown.tolist(), strict=True))
+
+    def draw(ax: Axes) -> Callable[[int], None]:
+        bars = ax.bar(np.arange(len(shown)), np.zeros(len(shown)), color="#ff922b")
+        ax.set(ylim=(0, 1), xlabel="states of the learned model", ylabel="belief")
+        ax.set_xticks(range(len(shown)), [str(n) for n in shown], fontsize=6.5)
+        ax.grid(visible=False, axis="x")
+
+        def update(t: int) -> None:
+            for bar, n in zip(bars, shown.tolist(), strict=True):
+                bar.set_height(beliefs[t, n])
+
+        return update
+
+    return Panel(draw, 3.7)

@@ -1,8 +1,41 @@
-"""Where the states of a learned model go on a picture: likely transitions are short (stress majorization)."""
+"""Where the states of a learned model go on a picture.
+
+Of a graph, likely transitions are short (stress majorization); a tree hangs from its root.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+
+
+def hang(parent: np.ndarray, leaves: int) -> np.ndarray:
+    """Place the nodes of a tree: a level lower for each step from the root, parents above their children.
+
+    Args:
+        parent: ``[M]``, -1 above the root, leaves first.
+        leaves: N; they get whole numbers along the first axis, in the order of the tree.
+
+    Returns:
+        ``[M, 2]``.
+
+    >>> hang(np.array([3, 4, 4, -1, 3]), 3).tolist()
+    [[0.0, -1.0], [1.0, -2.0], [2.0, -2.0], [0.75, 0.0], [1.5, -1.0]]
+    """
+    place = np.zeros((len(parent), 2))
+    placed = 0
+
+    def below(node: int, depth: int) -> float:
+        nonlocal placed
+        if node < leaves:
+            across, placed = float(placed), placed + 1
+        else:
+            ends = [below(int(child), depth + 1) for child in np.flatnonzero(parent == node)]
+            across = (ends[0] + ends[-1]) / 2
+        place[node] = across, -depth
+        return across
+
+    below(int(np.flatnonzero(parent < 0)[0]), 0)
+    return place
 
 
 def spread(weight: np.ndarray, iterations: int = 300, apart: float = 0.0) -> np.ndarray:

@@ -5,7 +5,7 @@ Matplotlib is loaded when a picture is made, and no window is needed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -75,6 +75,16 @@ class Bars(NamedTuple):
     counts: Sequence[Interval]
 
 
+class Panel(NamedTuple):
+    """Part of an animation: ``draw(axes)`` gives a function of the step, which brings it up to date.
+
+    ``width`` is in inches.
+    """
+
+    draw: Callable[[Axes], Callable[[int], None]]
+    width: float
+
+
 def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG, in this module's style, and return the path."""
     import matplotlib
@@ -95,6 +105,21 @@ def new_figure(
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         return figure, figure.subplots(rows, columns, **settings)
+
+
+def camera(figure: Figure) -> Callable[[], np.ndarray]:
+    """Return what gives a figure as a frame, uint8 ``[height, width, 3]``; it is laid out once."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure.set_dpi(72)
+    canvas = FigureCanvasAgg(figure)
+
+    def grab() -> np.ndarray:
+        canvas.draw()
+        figure.set_layout_engine("none")
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    return grab
 
 
 def moving_average(values: np.ndarray, window: int) -> np.ndarray:

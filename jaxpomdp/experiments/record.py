@@ -241,6 +241,18 @@ def read_table(file: Path) -> dict[str, np.ndarray]:
     return dict(zip(header, columns, strict=True))
 
 
+def read_lines(file: Path) -> list[Any]:
+    """Return the objects of a log, one a line; none where there is no file.
+
+    Raises:
+        RunDirectoryError: a line is damaged.
+    """
+    try:
+        return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+    except (OSError, ValueError) as error:
+        raise RunDirectoryError(f"{file} is not readable: {error}") from None
+
+
 def by_seed(table: Mapping[str, np.ndarray], column: str) -> np.ndarray:
     """Return one column as ``[S, rows per seed]``, seeds and rows in the order of the file."""
     seeds = table["seed"]

@@ -1,4 +1,4 @@
-"""A trained agent in two pictures: its belief over one trial, and the model it has learned."""
+"""A trained agent in pictures: its belief over one trial, the model it has learned, and how a tree grew."""
 
 from __future__ import annotations
 
@@ -9,15 +9,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxpomdp import packing
 from jaxpomdp.agents.trial import first_belief, memory_of, next_belief
 from jaxpomdp.experiments.drawing import ModelGraph, belief_animation, model_graph
-from jaxpomdp.experiments.record import RunDirectoryError
-from jaxpomdp.experiments.restore import restore
+from jaxpomdp.experiments.record import RunDirectoryError, read_lines
+from jaxpomdp.experiments.restore import Restored, restore
 from jaxpomdp.experiments.results import load_run, score
 from jaxpomdp.experiments.runner import Build, build
 from jaxpomdp.experiments.stats import median_run
+from jaxpomdp.experiments.tree_animation import edit_title, growth_animation, tree_panel
+from jaxpomdp.experiments.tree_drawing import symbol_names, tree_picture
 from jaxpomdp.experiments.walk import Mind, meaning, walk
 from jaxpomdp.models.family import Family
+from jaxpomdp.models.hierarchical import TreeParams
+from jaxpomdp.structure.tree import TreeSpec
+from jaxpomdp.structure.tree_edits import shape_of
+from jaxpomdp.structure.tree_growth import grown_to
 
 WALKS = 60
 """Trials from which it is learned what each state of the model stands for."""
@@ -26,6 +33,8 @@ CHANCE = 7
 
 def show(path: Path, out: Path, *, seed: int | None = None, trial: int = 0, make: Build = build) -> list[str]:
     """Draw ``belief.gif`` and ``model.png`` for one seed of a run, and return what to tell about them.
+
+    Of a hierarchical model also ``tree.png`` and ``growth.gif``, and the belief flows through its tree.
 
     Args:
         path: the run directory.
@@ -44,15 +53,41 @@ def show(path: Path, out: Path, *, seed: int | None = None, trial: int = 0, make
     walks = [walk(found.world, mind, CHANCE, k) for k in range(WALKS)]
     chosen = walk(found.world, mind, CHANCE, trial)
     heat = chosen.beliefs @ meaning(found.world, walks)
+    tree = packing.unpack(found.state.params, index) if isinstance(params, TreeParams) else None
     name = f"{found.config.env}, {found.config.agent}, seed {found.config.seeds[index]}"
     occupancy = np.concatenate([w.beliefs for w in walks]).mean(axis=0)
     graph = graph_of(family, params, q, occupancy, found.world.num_observations)
     ended = "reaches the goal" if chosen.rewards[-1] > found.world.success_above else "ends"
+    names = found.world.observation_names
+    panel = None if tree is None else tree_panel(tree, nodes_of(tree, params, chosen.beliefs), names)
+    film = belief_animation(found.world, chosen, heat, out / "belief.gif", panel=panel)
+    picture = model_graph(graph, found.world, out / "model.png", title=name)
     return [
-        f"{belief_animation(found.world, chosen, heat, out / 'belief.gif')}: {name}, "
-        f"{ended} after {len(chosen.actions)} steps",
-        f"{model_graph(graph, found.world, out / 'model.png', title=name)}: its {len(graph.value)} states",
+        f"{film}: {name}, {ended} after {len(chosen.actions)} steps",
+        f"{picture}: its {len(graph.value)} states",
+        *([] if tree is None else show_tree(path, found, index, tree, out, name)),
     ]
+
+
+def nodes_of(tree: TreeSpec, params: TreeParams, beliefs: np.ndarray) -> np.ndarray:
+    """Return the belief over nodes ``[T, M]`` of one over leaves ``[T, capacity]``, without spare slots."""
+    return beliefs[:, np.flatnonzero(np.asarray(params.alive))] @ tree.below.T
+
+
+def show_tree(path: Path, found: Restored, index: int, tree: TreeSpec, out: Path, title: str) -> list[str]:
+    """Draw one seed's tree and how it grew, and return what to tell about them."""
+    seeds, names = found.config.seeds, found.world.observation_names
+    picture = tree_picture(tree, out / "tree.png", colour="return", names=names, title=title)
+    lines = [f"{picture}: its {tree.num_states} leaves and {tree.num_internal} internal states"]
+    first = packing.unpack(found.agent.init(np.asarray(seeds)).params, index)
+    rows = [row for row in read_lines(path / "edits.jsonl") if row["seed"] == seeds[index]]
+    try:
+        shapes = grown_to(shape_of(first), shape_of(tree), rows)
+    except ValueError as error:
+        return [*lines, f"no growth.gif: {error} (did it begin again on the way?)"]
+    titles = [f"at the start: {first.num_states} leaves", *map(edit_title, rows[: len(shapes) - 1])]
+    film = growth_animation(shapes, titles, out / "growth.gif", names=symbol_names(tree, names))
+    return [*lines, f"{film}: its {len(shapes) - 1} edits"]
 
 
 def _index(path: Path, seeds: tuple[int, ...], seed: int | None, complete: bool) -> int:

@@ -18,7 +18,7 @@ from jaxpomdp.structure.significance import two_sample
 from jaxpomdp.structure.spec import Channel, safe_log
 from jaxpomdp.structure.tree import TreeSpec, name_of
 from jaxpomdp.structure.tree_edits import branch_leaves, clone_branch, new_level, with_returns
-from jaxpomdp.structure.tree_evidence import TreeEvidence, conditioned, mean_and_var
+from jaxpomdp.structure.tree_evidence import TreeEvidence, conditioned, effective, mean_and_var
 from jaxpomdp.structure.tree_tests import Conditions, Finding, TreeSplitConfig, conditions_of, findings
 
 
@@ -32,7 +32,7 @@ class TreeSplit(NamedTuple):
         leaf_shares: ``[N]``, share of the transition from each leaf that goes to the copy.
         node_shares: ``[I]``, of that from each internal state.
         entry_share: of the entry from the parent.
-        symbols: ``[2, O]``, observations of the leaf and its copy; None: copied.
+        symbols: ``[2, O]``, observations of the leaf and its copy, channels jointly; None: copied.
         returns: ``[2, 2]``, mean and variance of the return of the leaf and its copy; None: copied.
         strong: share of the new level.
         stay: share of a leaf's transition to itself that each of the two keeps; None: shared like the rest.
@@ -178,7 +178,7 @@ def _given_shares(
     """
     shares = np.full(len(conditions.nodes), 0.5)
     if finding.action >= 0:
-        hist = conditioned(evidence.returns[:, :, finding.action], finding.leaf, conditions.groups)
+        hist = effective(evidence.returns[:, :, finding.action], finding.leaf, conditions.groups)
         left, right = (hist[conditions.nodes == node] for node in (finding.left, finding.right))
         like = [two_sample(hist, np.broadcast_to(h, hist.shape)).p_value for h in (left, right)]
         total = like[0] + like[1]
@@ -191,7 +191,7 @@ def _given_shares(
 
 
 def _of_pair(conditions: Conditions, finding: Finding) -> np.ndarray:
-    """Return ``[2, N]``: the groups of the two conditions."""
+    """Return ``[2, N+1]``: the groups of the two conditions."""
     return np.concatenate([conditions.groups[conditions.nodes == n] for n in (finding.left, finding.right)])
 
 
@@ -226,15 +226,36 @@ def _shares(spec: TreeSpec, split: TreeSplit) -> np.ndarray:
 
 def _told_apart(spec: TreeSpec, split: TreeSplit, pair: Sequence[int]) -> TreeSpec:
     """Give the leaf and its copy what was found after the one condition and after the other."""
-    if split.symbols is not None and spec.emissions and spec.emissions[0].kind == "Categorical":
-        table = spec.emissions[0].values["log_prob"].copy()
-        table[list(pair)] = safe_log(split.symbols)
-        spec = replace(spec, emissions=(Channel("Categorical", {"log_prob": table}), *spec.emissions[1:]))
+    if split.symbols is not None:
+        spec = replace(spec, emissions=_with_symbols(spec.emissions, split.symbols, list(pair)))
     if split.returns is not None:
         column = split.action if spec.return_mean.shape[1] > 1 else 0
         for leaf, (mean, var) in zip(pair, split.returns, strict=True):
             spec = with_returns(spec, leaf, column, float(mean), float(var))
     return spec
+
+
+def _with_symbols(channels: tuple[Channel, ...], symbols: np.ndarray, pair: list[int]) -> tuple[Channel, ...]:
+    """Give the two leaves of a pair new rows in the channels that the symbols ``[2, O]`` code.
+
+    Symbols number what was seen in one or more channels together, the first the most significant digit
+    (``agents.tree_evidence.joint_symbols``). They code the first categorical channels, as many as have O
+    combinations, and each gets its marginal distribution. Other channels, and all where none fit (symbols
+    that are bins of numbers), keep the copied rows.
+    """
+    places = [c for c, channel in enumerate(channels) if channel.kind == "Categorical"]
+    sizes = [channels[c].values["log_prob"].shape[1] for c in places]
+    fits = [k for k in range(1, len(sizes) + 1) if np.prod(sizes[:k]) == symbols.shape[1]]
+    if not fits:
+        return channels
+    coded, told = sizes[: fits[0]], list(channels)
+    joint = symbols.reshape(2, *coded)
+    for k, place in enumerate(places[: len(coded)]):
+        others = tuple(1 + axis for axis in range(len(coded)) if axis != k)
+        table = channels[place].values["log_prob"].copy()
+        table[pair] = safe_log(joint.sum(others))
+        told[place] = Channel("Categorical", {"log_prob": table})
+    return tuple(told)
 
 
 def _one_per_top(edits: list[Edit]) -> list[Edit]:
@@ -260,7 +281,9 @@ BROTHER_SPLIT = _operator("brother")
 UNCLE_SPLIT = _operator("uncle")
 """The branch of a leaf whose return depends on which uncle was active before is copied whole (6.3.3)."""
 PARENT_SPLIT = _operator("parent")
-"""Where a leaf's return depends on who activated its parent, a level is added below the parent (6.3.4)."""
+"""Where a leaf's return depends on who activated its parent, a level is added below the parent (6.3.4).
+
+The root is activated by a trial's start, and by itself where a transition could be a starting over."""
 
 TREE_OPERATORS = {o.kind: o for o in (OBSERVATION_SPLIT, BROTHER_SPLIT, UNCLE_SPLIT, PARENT_SPLIT)}
 """The tree's operators by name, in their order; the cousin split's place is last."""

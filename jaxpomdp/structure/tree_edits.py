@@ -7,22 +7,18 @@ it was for any shares. Old leaves and internal states keep their numbers; copies
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxpomdp.structure.spec import safe_log
 from jaxpomdp.structure.tree import TreeSpec, allowed_horizontal, allowed_vertical
-from jaxpomdp.structure.tree_forms import maximal, minimal
+from jaxpomdp.structure.tree_forms import closed, opened
+from jaxpomdp.structure.tree_growth import Growth, Shape, branch_copied, level_added
 
 
-class Copied(NamedTuple):
-    """A tree that has grown: its parents, and the old leaf and internal state that each new one reads."""
-
-    leaf_parent: np.ndarray
-    node_parent: np.ndarray
-    leaf_origin: np.ndarray
-    node_origin: np.ndarray
+def shape_of(spec: TreeSpec) -> Shape:
+    """Return the shape of a tree, without its numbers."""
+    return Shape(spec.leaf_parent, spec.node_parent)
 
 
 def branch_leaves(spec: TreeSpec, node: int) -> np.ndarray:
@@ -47,7 +43,7 @@ def clone_branch(spec: TreeSpec, node: int, shares: np.ndarray, stay: float | No
         raise ValueError(f"node must be 0 .. {spec.num_nodes - 1} and not the root, got {node}")
     if shares.shape != (spec.num_nodes + 1,) or (shares < 0).any() or (shares > 1).any():
         raise ValueError(f"shares must be [{spec.num_nodes + 1}] between 0 and 1, got {shares.shape}")
-    copied = _copied(spec, np.array([node]), spec.parent[node] - spec.root)
+    copied = branch_copied(shape_of(spec), node)
     top, twin = _twins(spec, copied, node)
     vertical, horizontal, origin = _read(spec, copied)
     from_rows = shares[origin][None].copy()
@@ -65,57 +61,28 @@ def new_level(spec: TreeSpec, node: int, strong: float) -> TreeSpec:
 
     The new child is activated with probability ``strong``, the others share the rest (thesis 6.3.4). Done in
     maximal self-referential form, where the new state ends whenever a child of it does and the node starts
-    over, so the model is the same.
+    over, so the model is the same. The root, which never ends, starts over with certainty (``opened``).
 
     Raises:
-        ValueError: the node is no internal state below the root.
+        ValueError: the node is no internal state.
     """
-    if not spec.root < node < spec.num_nodes:
-        raise ValueError(f"node must be an internal state below the root, got {node}")
-    most = maximal(spec)
+    if not spec.root <= node < spec.num_nodes:
+        raise ValueError(f"node must be an internal state, got {node}")
+    most = opened(spec)
     number = node - spec.root
-    copied = _copied(most, most.children(node), spec.num_internal)
-    copied = copied._replace(
-        node_parent=np.insert(copied.node_parent, spec.num_internal, number),
-        node_origin=np.insert(copied.node_origin, spec.num_internal, number),
-    )
+    copied = level_added(shape_of(most), node)
     vertical, horizontal, _ = _read(most, copied)
-    leaves = len(copied.leaf_origin)
-    new = leaves + spec.num_internal
+    new = len(copied.leaf_origin) + spec.num_internal
     horizontal[:, new] = 0
     horizontal[:, new, -1] = 1
+    if node == spec.root:
+        vertical[:, spec.num_internal] = vertical[-1, spec.num_internal]
     vertical[:, number] *= 1 - strong
-    vertical[:, number, new] = strong
-    return minimal(_grown(most, copied, vertical, horizontal))
+    vertical[-1 if node == spec.root else slice(None), number, new] = strong
+    return closed(_grown(most, copied, vertical, horizontal))
 
 
-def _copied(spec: TreeSpec, tops: np.ndarray, parent: int) -> Copied:
-    """Copy the branches of these nodes below internal state ``parent``.
-
-    Where that is a new state (number I), copied internal states are numbered after it.
-    """
-    n, i = spec.num_states, spec.num_internal
-    inside = spec.below[tops].any(0)
-    leaves = np.flatnonzero(inside)
-    internal = np.array([m for m in range(n, n + i) if _within(spec, m, tops)], int) - n
-    first = i + (parent == i)
-    number = np.full(i + 1, -1)
-    number[internal] = first + np.arange(len(internal))
-
-    def moved(old: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        return np.where(np.isin(nodes, tops), parent, number[old])
-
-    leaf_parent = np.concatenate([spec.leaf_parent, moved(spec.leaf_parent[leaves], leaves)])
-    node_parent = np.concatenate([spec.node_parent, moved(spec.node_parent[internal], internal + n)])
-    return Copied(
-        leaf_parent,
-        node_parent,
-        np.concatenate([np.arange(n), leaves]),
-        np.concatenate([np.arange(i), internal]),
-    )
-
-
-def _twins(spec: TreeSpec, copied: Copied, node: int) -> tuple[int, int]:
+def _twins(spec: TreeSpec, copied: Growth, node: int) -> tuple[int, int]:
     """Return the numbers in the grown tree of a branch's top and of its copy."""
     n, i, grown = spec.num_states, spec.num_internal, len(copied.leaf_origin)
     if node < n:
@@ -124,32 +91,23 @@ def _twins(spec: TreeSpec, copied: Copied, node: int) -> tuple[int, int]:
     return grown + node - n, grown + copy
 
 
-def _within(spec: TreeSpec, node: int, tops: np.ndarray) -> bool:
-    while node >= 0 and node not in tops:
-        node = int(spec.parent[node])
-    return node >= 0
-
-
-def _read(spec: TreeSpec, copied: Copied) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _read(spec: TreeSpec, copied: Growth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the grown tables, each entry that of the originals where the grown tree has one; and origins."""
     origin = np.concatenate([copied.leaf_origin, copied.node_origin + spec.num_states])
     columns = np.append(origin, spec.num_nodes)
     vertical = np.exp(spec.log_vertical.astype(float))[:, copied.node_origin][:, :, origin]
     horizontal = np.exp(spec.log_horizontal.astype(float))[:, origin][:, :, columns]
     shape = _grown(spec, copied, vertical, horizontal)
-    return (
-        vertical * allowed_vertical(shape),
-        horizontal * allowed_horizontal(shape, self_referential=True),
-        origin,
-    )
+    places = allowed_horizontal(shape, self_referential=True)
+    places[:, -1] |= shape.parent == shape.root
+    return vertical * allowed_vertical(shape), horizontal * places, origin
 
 
-def _grown(spec: TreeSpec, copied: Copied, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
+def _grown(spec: TreeSpec, copied: Growth, vertical: np.ndarray, horizontal: np.ndarray) -> TreeSpec:
     dtype = spec.log_vertical.dtype
     leaves = copied.leaf_origin
     return TreeSpec(
-        copied.leaf_parent,
-        copied.node_parent,
+        *copied.shape,
         safe_log(vertical).astype(dtype),
         safe_log(horizontal).astype(dtype),
         tuple(channel.take(leaves) for channel in spec.emissions),

@@ -108,25 +108,92 @@ def maximal(spec: TreeSpec) -> TreeSpec:
     return _with_horizontal(spec, horizontal)
 
 
+def opened(spec: TreeSpec) -> TreeSpec:
+    """Return the maximal form in which the root, too, starts over as often as it can.
+
+    The root is entered when a trial starts, and never ends. A transition between two of its children may
+    still be a starting over, by the distribution of starts: child c becomes one that ends with ``e(c) =
+    min_c' T(c, c') / pi(c')`` and goes on by ``T(c, c') - e(c) pi(c')``. These ends are in the last column,
+    where trees have none; ``closed`` gives the tree back.
+    """
+    most = maximal(spec)
+    horizontal = np.exp(most.log_horizontal.astype(float))
+    children = most.children(most.root)
+    again = vertical_under_actions(most, most.root)[:, None, children]
+    across = horizontal[:, children[:, None], children[None]]
+    ends = np.where(again > 0, across / np.where(again > 0, again, 1), np.inf).min(-1)
+    horizontal[:, children[:, None], children[None]] = _less(across, ends[..., None] * again)
+    horizontal[:, children, -1] = ends
+    return _with_horizontal(most, horizontal)
+
+
+def closed(spec: TreeSpec) -> TreeSpec:
+    """Return the minimal form of a tree whose root starts over when a child of it ends (``opened``)."""
+    horizontal = np.exp(spec.log_horizontal.astype(float))
+    _start_over(spec, horizontal, spec.root, np.ones(spec.num_actions))
+    return minimal(_with_horizontal(spec, horizontal))
+
+
+def starting_over(spec: TreeSpec) -> np.ndarray:
+    """Return ``[A, N, N]``: what share of ``T*(k, l)`` the starting over of l's parent has (maximal form).
+
+    For k below l's parent p it is ``[product of T(n, end) from k up to below p] T(p, p) pi(l) / T*(k, l)``;
+    the rest are ways that turn below p, or above it. For other k it is zero.
+    """
+    most, flat = opened(spec), np.exp(flatten_tree(spec).log_trans.astype(float))
+    share = np.zeros_like(flat)
+    for node in range(most.root, most.num_nodes):
+        leaves = most.children(node)
+        leaves = leaves[leaves < most.num_states]
+        again = self_share(most, node)[:, None] * vertical_under_actions(most, node)[:, leaves]
+        way = _ends_up_to(most, node)[:, :, None] * again[:, None]
+        whole = flat[:, :, leaves]
+        share[:, :, leaves] = np.where(whole > 0, way / np.where(whole > 0, whole, 1), 0).clip(0, 1)
+    return share
+
+
+def _ends_up_to(spec: TreeSpec, node: int) -> np.ndarray:
+    """Return ``[A, N]``: the product of ends from each leaf up to below an internal state; 0 elsewhere."""
+    ends = np.exp(spec.log_horizontal[:, :, -1].astype(float))
+    under, at = spec.below[node], np.arange(spec.num_states)
+    total = np.broadcast_to(under.astype(float), (spec.num_actions, len(at)))
+    for _ in range(int(spec.depth.max())):
+        climbing = under & (at != node)
+        total = total * np.where(climbing, ends[:, at], 1)
+        at = np.where(climbing, spec.parent[at], at)
+    return total
+
+
 def self_share(spec: TreeSpec, node: int) -> np.ndarray:
-    """Return ``[A]``: with what probability an internal state follows itself."""
+    """Return ``[A]``: with what probability an internal state follows itself; the root does nothing else."""
+    if node == spec.root:
+        return np.ones(spec.num_actions)
     return np.exp(spec.log_horizontal[:, node, node].astype(float))
 
 
 def vertical_under_actions(spec: TreeSpec, node: int) -> np.ndarray:
-    """Return ``[A, M]``: what an internal state activates when it is entered under each action."""
+    """Return ``[A, M]``: what an internal state activates when it is entered under each action.
+
+    The root is entered at starts alone, whatever the action.
+    """
     row = np.exp(spec.log_vertical[:, node - spec.root].astype(float))
-    return row[:-1] if len(row) > 1 else np.repeat(row, spec.num_actions, 0)
+    by_action = len(row) > 1 and node != spec.root
+    return row[:-1] if by_action else np.repeat(row[-1:], spec.num_actions, 0)
 
 
-def _remove_self(spec: TreeSpec, horizontal: np.ndarray, node: int) -> None:
-    share = horizontal[:, node, node].copy()
+def _start_over(spec: TreeSpec, horizontal: np.ndarray, node: int, share: np.ndarray) -> None:
+    """Let a share ``[A]`` of the ends of a node's children lead to the node's children again."""
     children = spec.children(node)
     again = vertical_under_actions(spec, node)[:, children]
     ends = horizontal[:, children, -1].copy()
     back = (ends * share[:, None])[..., None] * again[:, None]
     horizontal[:, children[:, None], children[None]] += back
     horizontal[:, children, -1] = ends * (1 - share)[:, None]
+
+
+def _remove_self(spec: TreeSpec, horizontal: np.ndarray, node: int) -> None:
+    share = horizontal[:, node, node].copy()
+    _start_over(spec, horizontal, node, share)
     horizontal[:, node, node] = 0
     left = 1 - share
     away = horizontal[:, node] / np.where(left > 0, left, 1)[:, None]
@@ -147,12 +214,16 @@ def _add_self(spec: TreeSpec, horizontal: np.ndarray, node: int) -> None:
     across = horizontal[:, children[:, None], children[None]]
     ratio = np.where(back > 0, across / np.where(back > 0, back, 1), np.inf).min((1, 2))
     ratio = np.where(np.isfinite(ratio), ratio, 0.0)[:, None]
-    rest = across - ratio[..., None] * back
-    smallest = 1e-12 * np.maximum(across, 1e-300)
-    horizontal[:, children[:, None], children[None]] = np.where(rest > smallest, rest, 0.0)
+    horizontal[:, children[:, None], children[None]] = _less(across, ratio[..., None] * back)
     horizontal[:, children, -1] = ends * (1 + ratio)
     horizontal[:, node] /= 1 + ratio
     horizontal[:, node, node] = (ratio / (1 + ratio))[:, 0]
+
+
+def _less(whole: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """Return ``whole - part``, exactly zero where no more than rounding is left."""
+    rest = whole - part
+    return np.where(rest > 1e-12 * np.maximum(whole, 1e-300), rest, 0.0)
 
 
 def _with_horizontal(spec: TreeSpec, horizontal: np.ndarray) -> TreeSpec:

@@ -25,6 +25,7 @@ def random_tree(
     *,
     levels: int = 3,
     form: Form = "diverse",
+    shape: Sequence[Any] | None = None,
     vertical_by_action: bool = False,
     return_by_action: bool = False,
     concentration: float = 1.0,
@@ -40,12 +41,14 @@ def random_tree(
         observations: how many symbols.
         levels: depth of the deepest leaf at most.
         form: see ``random_shape``.
+        shape: nested lists of the leaves 0 .. states-1, as ``[0, [1, 2]]``; drawn as ``levels`` and ``form``
+            say if None.
         vertical_by_action: vertical transitions depend on the action.
         return_by_action: returns are modelled per leaf and action.
         concentration: the Dirichlet's parameter.
 
     Raises:
-        ValueError: a size is below one, or the form is unknown.
+        ValueError: a size is below one, the form is unknown, or the shape is of other leaves.
 
     >>> tree = random_tree(0)
     >>> tree.num_states, int(tree.depth.max())
@@ -68,6 +71,7 @@ def random_tree(
         flat,
         levels=levels,
         form=form,
+        shape=shape,
         vertical_by_action=vertical_by_action,
         concentration=concentration,
     )
@@ -87,15 +91,6 @@ def tree_over(
 
     Its transitions are drawn anew (arguments as ``random_tree``).
 
-    Args:
-        seed: an integer, or a generator.
-        flat: the leaves.
-        levels: depth of the deepest leaf at most.
-        form: see ``random_shape``.
-        shape: the tree as nested lists of the leaves' numbers, instead of a random one.
-        vertical_by_action: vertical transitions depend on the action.
-        concentration: the Dirichlet's parameter.
-
     Raises:
         ValueError: a size is below one, the form is unknown, or the shape is of other leaves.
     """
@@ -103,20 +98,20 @@ def tree_over(
     rng = np.random.default_rng(seed)
     parents = nested(random_shape(rng, flat.num_states, levels, form) if shape is None else shape)
     if len(parents[0]) != flat.num_states:
-        raise ValueError(f"shape must have {flat.num_states} leaves, got {len(parents[0])}")
+        raise ValueError(f"shape must hold {flat.num_states} leaves, got {len(parents[0])}")
     n, internal, a = flat.num_states, len(parents[1]), flat.num_actions
     tables = a + 1 if vertical_by_action else 1
     m, dtype = n + internal, flat.log_trans.dtype
     blank = np.zeros((tables, internal, m)), np.zeros((a, m, m + 1))
-    tree = TreeSpec(
+    empty = TreeSpec(
         parents[0], parents[1], blank[0], blank[1], flat.emissions, flat.return_mean, flat.return_var
     )
-    vertical = _random_rows(rng, allowed_vertical(tree), tables, concentration)
-    horizontal = _random_rows(rng, allowed_horizontal(tree), a, concentration)
+    vertical = _random_rows(rng, allowed_vertical(empty), tables, concentration)
+    horizontal = _random_rows(rng, allowed_horizontal(empty), a, concentration)
     if tables > 1:
         vertical[:-1, 0] = 0
     down, across = safe_log(vertical).astype(dtype), safe_log(horizontal).astype(dtype)
-    return replace(tree, log_vertical=down, log_horizontal=across)
+    return replace(empty, log_vertical=down, log_horizontal=across)
 
 
 def random_shape(rng: np.random.Generator, states: int, levels: int, form: Form = "diverse") -> list[Any]:

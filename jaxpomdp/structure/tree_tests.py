@@ -14,8 +14,8 @@ import numpy as np
 
 from jaxpomdp.structure.significance import Correction, adjust, homogeneity, two_sample
 from jaxpomdp.structure.tree import TreeSpec
-from jaxpomdp.structure.tree_evidence import TreeEvidence, conditioned
-from jaxpomdp.structure.tree_forms import maximal, self_share, vertical_under_actions
+from jaxpomdp.structure.tree_evidence import TreeEvidence, effective
+from jaxpomdp.structure.tree_forms import starting_over
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TreeSplitConfig:
     correction: Correction = "holm"
     """correction for testing many pairs of conditions: none, bonferroni, holm or benjamini-hochberg"""
     minimum_weight: float = 30.0
-    """least weight of evidence under each of the two conditions"""
+    """least number of observations that the evidence under each of the two conditions is worth"""
     minimum_effect: float = 0.0
     """least Cramer's V, whatever the weight"""
     strong: float = 0.95
@@ -58,7 +58,7 @@ class TreeSplitConfig:
 class Conditions(NamedTuple):
     """The previous activity that a test of one leaf tells apart: ``nodes[C]`` (-1: the parent's entry).
 
-    ``groups[C, N]`` holds the weight of each previous leaf in each condition.
+    ``groups[C, N+1]`` holds the weight in each condition of each previous leaf, and of the start of a trial.
     """
 
     nodes: np.ndarray
@@ -79,42 +79,44 @@ class Finding(NamedTuple):
 
 
 def brothers(spec: TreeSpec, leaf: int) -> Conditions:
-    """Return a leaf's siblings, itself among them, and the entry through its parent."""
+    """Return a leaf's siblings, itself among them, and the entry through its parent (as at starts)."""
     siblings = spec.children(int(spec.parent[leaf]))
     outside = ~spec.below[spec.parent[leaf]]
-    return Conditions(np.append(siblings, -1), np.concatenate([spec.below[siblings], outside[None]]))
+    inside = _without_starts(spec.below[siblings])
+    return Conditions(np.append(siblings, -1), np.concatenate([inside, _with_starts(outside)[None]]))
 
 
 def uncles(spec: TreeSpec, leaf: int) -> Conditions:
     """Return the siblings of a leaf's parent; a leaf below the root has none."""
     parent = int(spec.parent[leaf])
     if parent == spec.root:
-        return Conditions(np.zeros(0, int), np.zeros((0, spec.num_states), bool))
+        return Conditions(np.zeros(0, int), np.zeros((0, spec.num_states + 1), bool))
     siblings = spec.children(int(spec.parent[parent]))
     siblings = siblings[siblings != parent]
-    return Conditions(siblings, spec.below[siblings])
+    return Conditions(siblings, _without_starts(spec.below[siblings]))
 
 
-def activations(spec: TreeSpec, most: TreeSpec, leaf: int, transitions: np.ndarray) -> Conditions:
-    """Return the parent as activated by itself (``most`` is the maximal form) and by another node.
+def activations(spec: TreeSpec, over: np.ndarray, leaf: int, transitions: np.ndarray) -> Conditions:
+    """Return a leaf's parent as activated by itself and by another node (the root: by a trial's start).
 
-    A transition from a brother k is split by what its ways in maximal form contribute: directly, or by an end
-    and the parent's starting over, ``T_max(k, end) s pi(leaf) / T_min(k, leaf)``.
+    Which of the two it was is not seen where a brother was active before: it weighs what share of the
+    transition is a starting over (``over``, from ``starting_over``), averaged over actions by their
+    ``transitions``.
     """
     parent = int(spec.parent[leaf])
-    if parent == spec.root:
-        return Conditions(np.zeros(0, int), np.zeros((0, spec.num_states)))
-    again = self_share(most, parent) * vertical_under_actions(spec, parent)[:, leaf]
-    way = np.exp(spec.log_horizontal[:, :, leaf].astype(float))
-    back = np.exp(most.log_horizontal[:, :, -1].astype(float)) * again[:, None]
-    share = np.where(way > 0, back / np.where(way > 0, way, 1), 0).clip(0, 1)
-    own = np.zeros(spec.num_states)
-    for child in spec.children(parent):
-        under = spec.below[child]
-        weight = transitions[:, under, leaf]
-        total = weight.sum(0)
-        own[under] = (share[:, child] @ weight) / np.where(total > 0, total, 1)
-    return Conditions(np.array([parent, -1]), np.stack([own, ~spec.below[parent]]))
+    weight = transitions[:, :, leaf]
+    total = weight.sum(0)
+    own = (over[:, :, leaf] * weight).sum(0) / np.where(total > 0, total, 1)
+    outside = _with_starts(~spec.below[parent])
+    return Conditions(np.array([parent, -1]), np.stack([_without_starts(own), outside]))
+
+
+def _with_starts(leaves: np.ndarray) -> np.ndarray:
+    return np.append(leaves, 1).astype(leaves.dtype)
+
+
+def _without_starts(leaves: np.ndarray) -> np.ndarray:
+    return np.concatenate([leaves, np.zeros_like(leaves[..., :1])], -1)
 
 
 def conditions_of(
@@ -123,8 +125,8 @@ def conditions_of(
     """Return the conditions that an operator tells apart, of every leaf that may be edited."""
     leaves = [int(leaf) for leaf in np.flatnonzero(free)]
     if kind == "parent":
-        most = maximal(spec)
-        return {leaf: activations(spec, most, leaf, evidence.transitions) for leaf in leaves}
+        over = starting_over(spec)
+        return {leaf: activations(spec, over, leaf, evidence.transitions) for leaf in leaves}
     return {leaf: (uncles if kind == "uncle" else brothers)(spec, leaf) for leaf in leaves}
 
 
@@ -156,7 +158,7 @@ def _tests(
     if not pairs:
         return
     left, right = np.array(pairs).T
-    hist = conditioned(table, leaf, conditions.groups)
+    hist = effective(table, leaf, conditions.groups)
     weight = hist.sum(-1)
     lighter = np.minimum(weight[left], weight[right])
     test: Any = _observations if seen else two_sample

@@ -104,7 +104,7 @@ def test_the_first_tree_may_be_given():
     agent = small(shape="[0, 1, [2, 3], [4, 5]]")
     for spec in agent.kind.unpack(agent.init(SEEDS).params):
         assert spec.leaf_parent.tolist() == [0, 0, 1, 1, 2, 2]
-    with pytest.raises(ValueError, match="shape must have 6 leaves, got 2"):
+    with pytest.raises(ValueError, match="shape must hold 6 leaves, got 2"):
         small(shape="[0, 1]").init(SEEDS)
     with pytest.raises(ValueError, match="shape must be like"):
         small(shape="[0, 1").init(SEEDS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -9,7 +11,7 @@ from PIL import Image
 from jaxpomdp.envs.registry import make
 from jaxpomdp.envs.world import model_of
 from jaxpomdp.experiments.drawing import ModelGraph, belief_animation, model_graph, sensed_sides
-from jaxpomdp.experiments.layout import spread
+from jaxpomdp.experiments.layout import hang, spread
 from jaxpomdp.experiments.plots import (
     Bars,
     Curve,
@@ -21,7 +23,12 @@ from jaxpomdp.experiments.plots import (
     moving_average,
 )
 from jaxpomdp.experiments.stats import Interval, wilson
+from jaxpomdp.experiments.tree_animation import growth_animation, tree_belief_animation
+from jaxpomdp.experiments.tree_drawing import activated, tree_picture
 from jaxpomdp.experiments.walk import Mind, meaning, walk
+from jaxpomdp.structure.tree_edits import shape_of
+from jaxpomdp.structure.tree_growth import branch_copied
+from jaxpomdp.structure.tree_init import random_tree
 
 WORLD = make("tmaze-2")
 TRUE = model_of(WORLD)
@@ -132,3 +139,69 @@ def test_the_animation_has_a_frame_for_each_step(tmp_path):
     with Image.open(path) as animation:
         assert animation.n_frames >= 3
         assert animation.size[0] > animation.size[1]
+
+
+def colours_in(path) -> set[tuple[int, ...]]:
+    return {tuple(pixel) for pixel in np.unique(drawn(path).reshape(-1, 3), axis=0).tolist()}
+
+
+def test_a_tree_is_drawn_by_what_its_leaves_show_return_or_are_given(tmp_path):
+    tree = random_tree(0, 8, 2, 3)
+    seen = tree_picture(tree, tmp_path / "seen.png", names=["a", "b", "c"], title="t")
+    paid = tree_picture(tree, tmp_path / "paid.png", colour="return")
+    given = tree_picture(tree, tmp_path / "given.png", colour=np.arange(8.0), label="number")
+    assert len(colours_in(given)) > len(colours_in(seen))
+    assert (drawn(paid) != drawn(given)).any()
+    for colour, message in (("blue", "got 'blue'"), (np.zeros(7), r"shape \(8,\), got \(7,\)")):
+        with pytest.raises(ValueError, match=message):
+            tree_picture(tree, tmp_path / "x.png", colour=colour)
+    with pytest.raises(ValueError, match="where nothing is a symbol"):
+        tree_picture(replace(tree, emissions=()), tmp_path / "x.png")
+
+
+def test_lines_down_are_as_thick_as_children_are_likely():
+    tree = random_tree(1, 9, 2, 3, vertical_by_action=True)
+    share = activated(tree)
+    for node in range(tree.root, tree.num_nodes):
+        assert share[tree.children(node)].sum() == pytest.approx(1)
+    assert share[tree.root] == 0
+
+
+def test_a_tree_hangs_with_parents_above_their_children():
+    tree = random_tree(2, 12, 1, 2)
+    place = hang(tree.parent, 12)
+    assert sorted(place[:12, 0].tolist()) == list(range(12))
+    np.testing.assert_array_equal(place[:, 1], -tree.depth)
+    for node in range(12, tree.num_nodes):
+        under = place[:12, 0][tree.below[node]]
+        assert under.max() - under.min() == len(under) - 1, "a branch's leaves are side by side"
+        assert under.min() <= place[node, 0] <= under.max()
+
+
+def test_growth_has_a_frame_for_each_tree_and_refuses_what_did_not_grow(tmp_path):
+    first = shape_of(random_tree(0, 6, 1, 2))
+    second = branch_copied(first, 2).shape
+    path = growth_animation([first, second], ["start", "copied"], tmp_path / "growth.gif")
+    with Image.open(path) as film:
+        frames = []
+        for k in range(2):
+            film.seek(k)
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+    orange = [((x[..., 0] - x[..., 2]) > 120).sum() for x in frames]
+    assert orange[0] == 0 < orange[1]
+    with pytest.raises(ValueError, match="shapes must grow"):
+        growth_animation([second, first], ["a", "b"], path)
+    with pytest.raises(ValueError, match="one for each shape, got 1 for 2"):
+        growth_animation([first, second], ["a"], path)
+
+
+def test_belief_flows_through_a_tree(tmp_path):
+    tree = random_tree(0, 6, 1, 2)
+    beliefs = np.random.default_rng(0).dirichlet(np.ones(6), 4) @ tree.below.T
+    path = tree_belief_animation(tree, beliefs, ["a", "b", "c", "d"], tmp_path / "flow.gif", most_frames=3)
+    with Image.open(path) as film:
+        assert film.n_frames >= 3
+    with pytest.raises(ValueError, match=r"beliefs must have shape \(T, "):
+        tree_belief_animation(tree, beliefs[:, :-1], ["a", "b", "c", "d"], path)
+    with pytest.raises(ValueError, match="one for each of 4 steps, got 1"):
+        tree_belief_animation(tree, beliefs, ["a"], path)

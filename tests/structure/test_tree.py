@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxpomdp.structure.spec import safe_log, validate
+from jaxpomdp.structure.spec import FlatSpec, safe_log, validate
 from jaxpomdp.structure.topology import check_topology, nested
 from jaxpomdp.structure.tree import TreeSpec, validate_tree
-from jaxpomdp.structure.tree_forms import flatten_tree, maximal, minimal, one_level, self_share
+from jaxpomdp.structure.tree_forms import (
+    closed,
+    flatten_tree,
+    maximal,
+    minimal,
+    one_level,
+    opened,
+    self_share,
+    starting_over,
+)
 from jaxpomdp.structure.tree_init import random_shape, random_tree
 from tests.oracles import tree as oracle
 from tests.structure.trees import make_tree, thesis_tree, trees
@@ -193,3 +203,77 @@ def test_a_diverse_tree_has_leaves_at_many_depths() -> None:
     assert max(max(d) for d in depths) == 3
     sober = random_tree(0, form="sober")
     assert set(sober.depth[:20].tolist()) == {2}
+
+
+def ways_by_turn(most: TreeSpec, k: int, leaf: int, action: int) -> dict[int, float]:
+    """The ways from k to l in opened form by the node at which they turn round; -1: from child to child."""
+    across = np.exp(most.log_horizontal[action])
+    tables = np.exp(most.log_vertical)
+    up, ends = [k], 1.0
+    turns, down = {}, way_down(most, leaf)
+    while up[-1] != most.root:
+        node = up[-1]
+        above = int(most.parent[node])
+        if above in down:
+            beside = down[down.index(above) + 1]
+            if node != beside or node == leaf:
+                turns[-1] = ends * across[node, beside] * entered(most, tables, down, beside, action)
+            again = 1.0 if above == most.root else across[above, above]
+            turns[above] = (
+                ends * across[node, -1] * again * entered(most, tables, down, above, action, start=True)
+            )
+        ends *= across[node, -1]
+        up.append(above)
+    return turns
+
+
+def way_down(most: TreeSpec, leaf: int) -> list[int]:
+    nodes = [leaf]
+    while nodes[0] != most.root:
+        nodes.insert(0, int(most.parent[nodes[0]]))
+    return nodes
+
+
+def entered(most: TreeSpec, tables, down, top: int, action: int, start: bool = False) -> float:
+    """The product of entries from a node down to the leaf; the root is entered as at a start."""
+    total = 1.0
+    for above, node in itertools.pairwise(down[down.index(top) :]):
+        by_start = above == most.root and start
+        table = tables[-1] if by_start or len(tables) == 1 else tables[action]
+        total *= table[above - most.root, node]
+    return total
+
+
+@given(trees(most=8), st.integers(0, 1))
+@settings(max_examples=40, deadline=None)
+def test_ways_that_start_over_at_any_level_and_direct_ones_are_all(spec: TreeSpec, action: int) -> None:
+    most, flat, over = opened(spec), flatten_tree(spec), starting_over(spec)
+    np.testing.assert_allclose(
+        np.exp(flatten_tree(closed(most)).log_trans), np.exp(flat.log_trans), atol=1e-10
+    )
+    for k, leaf in itertools.product(range(spec.num_states), repeat=2):
+        turns = ways_by_turn(most, k, leaf, action)
+        whole = np.exp(flat.log_trans[action, k, leaf])
+        assert sum(turns.values()) == pytest.approx(whole, abs=1e-9)
+        parent = int(spec.parent[leaf])
+        if parent in turns:
+            assert over[action, k, leaf] * whole == pytest.approx(turns[parent], abs=1e-9)
+        else:
+            assert over[action, k, leaf] == 0
+
+
+def test_opening_a_tree_of_one_level_finds_its_restarts() -> None:
+    """Rows of a third of a fresh start and two thirds of staying."""
+    start = np.array([0.2, 0.3, 0.5])
+    rows = np.eye(3) * 2 / 3 + start / 3
+    spec = one_level(FlatSpec.from_probabilities(start, rows[None], (np.eye(3),)))
+    np.testing.assert_allclose(np.exp(opened(spec).log_horizontal[0, :3, -1]), 1 / 3)
+    np.testing.assert_allclose(starting_over(spec)[0], start / 3 / rows)
+
+
+def test_a_random_tree_may_be_of_a_given_shape() -> None:
+    spec = random_tree(0, 5, 2, 3, shape=[0, [1, [2, 3]], 4])
+    validate_tree(spec)
+    assert spec.leaf_parent.tolist() == [0, 1, 2, 2, 0]
+    with pytest.raises(ValueError, match="shape must hold 6 leaves, got 5"):
+        random_tree(0, 6, 2, 3, shape=[0, [1, [2, 3]], 4])

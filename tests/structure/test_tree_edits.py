@@ -43,9 +43,7 @@ def test_a_copied_branch_changes_nothing(spec: TreeSpec, seed: int) -> None:
 @given(trees(), st.integers(0, 1000), st.floats(0.5, 0.99))
 @settings(max_examples=40, deadline=None)
 def test_a_new_level_changes_nothing(spec: TreeSpec, seed: int, strong: float) -> None:
-    if spec.num_internal == 1:
-        return
-    node = int(np.random.default_rng(seed).integers(spec.root + 1, spec.num_nodes))
+    node = int(np.random.default_rng(seed).integers(spec.root, spec.num_nodes))
     grown = new_level(spec, node, strong)
     validate_tree(grown)
     copied = branch_leaves(spec, node)
@@ -59,8 +57,8 @@ def test_a_new_level_changes_nothing(spec: TreeSpec, seed: int, strong: float) -
 def test_edits_one_after_the_other_change_nothing(spec: TreeSpec, seed: int) -> None:
     rng, first, origin = np.random.default_rng(seed), spec, np.arange(spec.num_states)
     for turn in range(3):
-        internal = np.arange(spec.root + 1, spec.num_nodes)
-        if turn == 1 and len(internal):
+        internal = np.arange(spec.root, spec.num_nodes)
+        if turn == 1:
             node = int(rng.choice(internal))
             grown = new_level(spec, node, 0.95)
         else:
@@ -96,5 +94,5 @@ def test_wrong_arguments_are_named() -> None:
         clone_branch(spec, 5, np.full(9, 0.5))
     with pytest.raises(ValueError, match=r"shares must be \[9\] between 0 and 1"):
         clone_branch(spec, 0, np.full(9, 1.5))
-    with pytest.raises(ValueError, match="internal state below the root, got 5"):
-        new_level(spec, 5, 0.9)
+    with pytest.raises(ValueError, match="must be an internal state, got 4"):
+        new_level(spec, 4, 0.9)
