@@ -45,7 +45,9 @@ def test_a_step_of_an_agent_costs_what_its_equations_say(load: Any) -> None:
     assert cost(own_model=True).flop == 2 * matrix + 5 * values + 6 * 70
 
 
-@pytest.mark.parametrize(("shares", "told"), [((0.3, 0.2), "arithmetic"), ((0.1, 0.9), "bandwidth")])
+@pytest.mark.parametrize(
+    ("shares", "told"), [((0.3, 0.2), "arithmetic"), ((0.1, 0.9), "bandwidth"), ((0.1, 3.0), "cache")]
+)
 def test_what_is_nearer_to_its_limit_bounds(load: Any, shares: tuple[float, float], told: str) -> None:
     bound = load("page").bound
     assert bound(*shares) == told

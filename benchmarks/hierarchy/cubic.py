@@ -1,8 +1,8 @@
 """Chapter 5's claim measured: linear in T, where the algorithm of Fine, Singer and Tishby (1998) is cubic.
 
 An E-step, which is what EM spends its time on, by their spans (``spans.py``) and through the flat chain, both
-in plain NumPy on one trial; against the steps T and against the leaves N. Run ``python -m
-benchmarks.hierarchy.cubic``.
+in plain NumPy on one trial and one core; against the steps T and the leaves N. Run ``python -m
+benchmarks.hierarchy.cubic`` with ``OPENBLAS_NUM_THREADS=1``.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from jaxpomdp.structure.tree_forms import flatten_tree
 from jaxpomdp.structure.tree_init import random_tree
 
 RESULT = Path(__file__).parents[1] / "results" / "hierarchy" / "cubic.json"
-LENGTHS, LONG = (16, 32, 64, 128, 192), (512, 1024, 2048, 4096)
-SIZES, MANY = (4, 9, 16, 36, 64), (144, 256)
-BASE_N, BASE_T = 9, 32
+LENGTHS, LONG = (32, 64, 128, 256, 512, 768), (1536, 3072, 6144)
+SIZES, MANY = (4, 9, 16, 36, 64, 144), (256,)
+BASE_N, BASE_T = 9, 128
 
 
 def flat_evidence(spec: TreeSpec, symbols: np.ndarray, actions: np.ndarray) -> float:
@@ -134,7 +134,7 @@ def main() -> None:
         for size, rows in sizes.items()
         for name in ("flat", "spans")
     }
-    command = " ".join(["python -m benchmarks.hierarchy.cubic", *sys.argv[1:]])
+    command = " ".join(["OPENBLAS_NUM_THREADS=1 python -m benchmarks.hierarchy.cubic", *sys.argv[1:]])
     result = {"command": command, "versions": versions(), "exponents": powers}
     RESULT.parent.mkdir(parents=True, exist_ok=True)
     RESULT.write_text(json.dumps(result | {"by_steps": by_steps, "by_leaves": by_leaves}, indent=1) + "\n")

@@ -28,12 +28,18 @@ class Counts(NamedTuple):
 
 
 class _Tables:
-    """Probabilities by step: ``down[T, I, M]`` on entering, ``across[T-1, M, M]``, ``ends[T, M]`` after."""
+    """Probabilities by step: ``down[T, I, M]`` on entering, ``across[T-1, M, M]``, ``ends[T, M]`` after.
+
+    ``seen[T, N]`` is relative to its mean over leaves, whose logarithms add up to ``scale``: products of
+    hundreds of probabilities would be too small for numbers.
+    """
 
     def __init__(self, spec: TreeSpec, symbols: np.ndarray, actions: np.ndarray) -> None:
         vertical, horizontal = np.exp(spec.log_vertical), np.exp(spec.log_horizontal)
         later = vertical[:-1] if len(vertical) > 1 else np.repeat(vertical, len(horizontal), 0)
-        self.seen = np.exp(spec.emissions[0].values["log_prob"])[:, symbols].T
+        seen = np.exp(spec.emissions[0].values["log_prob"])[:, symbols].T
+        self.scale = float(np.log(seen.mean(1)).sum())
+        self.seen = seen / seen.mean(1, keepdims=True)
         self.down = np.concatenate([vertical[-1:], later[actions]])
         self.across = horizontal[actions][:, :, :-1]
         self.ends = np.concatenate([horizontal[actions][:, :, -1], np.ones((1, spec.num_nodes))])
@@ -54,8 +60,8 @@ class _Node(NamedTuple):
 
 def span_evidence(spec: TreeSpec, symbols: np.ndarray, actions: np.ndarray) -> float:
     """Return the log-probability of one trial of ``T`` symbols and ``T - 1`` actions."""
-    root = _inside(spec, _Tables(spec, symbols, actions))[spec.root]
-    return float(np.log(root.inside[0, -1]))
+    tables = _Tables(spec, symbols, actions)
+    return float(np.log(_inside(spec, tables)[spec.root].inside[0, -1])) + tables.scale
 
 
 def _inside(spec: TreeSpec, tables: _Tables) -> dict[int, _Node]:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from workloads import LOADS
+
+Panel = Callable[[Any], None]
+"""Draws on the axes that it is given."""
+
+ACROSS = 4
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -16,29 +22,35 @@ def draw(result: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(3, 5, figsize=(23, 12), layout="constrained")
-    flat = list(axes.flat)
-    for part in (p for p in LOADS if p in result):
-        _bars(flat.pop(0), f"{part}: milliseconds an E-step", result[part])
+    panels = list(_panels(result))
+    down = max(-(-len(panels) // ACROSS), 1)
+    figure, axes = plt.subplots(down, ACROSS, figsize=(4.6 * ACROSS, 4 * down), layout="constrained")
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for axis, panel in zip(axes.flat, panels, strict=False):
+        axis.set_axis_on()
+        panel(axis)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+def _panels(result: Mapping[str, Any]) -> Iterator[Panel]:
+    for part in (p for p in sorted(LOADS) if p in result):
+        yield partial(_bars, title=f"{part}: milliseconds an E-step", part=result[part])
     for name, one in (("W5", _acting), ("W6", _training), ("seeds", _seeds), ("long", _long)):
         if name in result:
-            one(flat.pop(0), result[name])
+            yield partial(one, part=result[name])
     for letter, curve in result.get("growth", {}).items():
-        axis = flat.pop(0)
-        for who, times in curve["milliseconds"].items():
-            axis.loglog(curve["sizes"][: len(times)], times, marker="o", label=who)
-        axis.set(title=f"growth with {letter}", xlabel=letter, ylabel="ms an E-step")
-        axis.legend()
-    for axis in flat:
-        axis.set_axis_off()
-    figure.savefig(path, dpi=70)
-    plt.close(figure)
+        times = curve["milliseconds"].items()
+        curves = {who: dict(zip(curve["sizes"], values, strict=False)) for who, values in times}
+        yield partial(_curves, curves=curves, title=f"growth with {letter}: ms an E-step", xlabel=letter)
 
 
 def _bars(axis: Any, title: str, part: dict[str, Any]) -> None:
     rows = part["contestants"]
     axis.barh(list(rows), [row["milliseconds"] for row in rows.values()])
     axis.set(title=title, xscale="log")
+    axis.xaxis.set_minor_formatter("")
     axis.invert_yaxis()
 
 

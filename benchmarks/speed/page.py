@@ -108,6 +108,8 @@ def bound(arithmetic: float, bandwidth: float) -> str:
     """Say what limits a time of which these are the shares."""
     if max(arithmetic, bandwidth) < IN_FULL:
         return "latency"
+    if bandwidth > 1:
+        return "cache"
     return "arithmetic" if arithmetic > bandwidth else "bandwidth"
 
 
@@ -147,8 +149,8 @@ def _acting(result: Mapping[str, Any]) -> str:
 {table(["who", "agents", "steps a second", "of GEMM", "of bandwidth", "bound by"], rows)}
 
 A step needs {shared.flop:,.0f} operations, and {shared.bytes:,.0f} bytes of values, traces and beliefs; with
-a model of its own {own.bytes:,.0f} bytes, most of them the matrix of the action. A share above 100 % says
-that they came from a cache."""
+a model of its own {own.bytes:,.0f} bytes, most of them the matrix of the action. Below {percent(IN_FULL)} of
+both limits it waits for the step before; above 100 % of the bandwidth, numbers came from a cache."""
     return "\n".join([text, *_left_out(found)])
 
 
