@@ -106,26 +106,30 @@ def coupled(base: AgentConfig, *, node_cap: int, **settings: Any) -> AgentConfig
 CUDHMM = coupled(HALLWAY, node_cap=30, return_cap=8)
 """The coupled agent in the hallway."""
 
-HUDHMM = replace(
-    UDHMM,
-    learner=replace(
+HUDHMM = AgentConfig(
+    UDHMM.control,
+    replace(
         UDHMM.learner,
         states=20,
-        theta=0.2,
+        return_by_action=True,
         policy=PolicyConfig(node_cap=100, edits_per_phase=2, order="rotate"),
     ),
-    model=HierarchicalModel(),
+    HierarchicalModel(form="sober", vertical_by_action=True),
 )
-"""The hierarchical agent with its operators in the 89-state maze (thesis 6.4.2)."""
+"""The hierarchical agent in the 89-state maze (thesis 6.4.2): 20 to 100 states, operators in turn."""
 
-HUDHMM_TMAZE = replace(
-    TMAZE,
-    learner=replace(
-        TMAZE.learner, states=20, policy=PolicyConfig(node_cap=60, edits_per_phase=2, order="rotate")
+HUDHMM_TMAZE = AgentConfig(
+    TMAZE.control,
+    replace(
+        TMAZE.learner,
+        states=20,
+        policy=PolicyConfig(node_cap=60, edits_per_phase=2, every=3, order="rotate"),
     ),
-    model=HierarchicalModel(tests=TreeSplitConfig(stay=0.9)),
+    HierarchicalModel(
+        vertical_by_action=True, operators=("uncle", "brother"), tests=TreeSplitConfig(stay=0.9)
+    ),
 )
-"""The hierarchical agent in the T-maze (thesis 6.4.1)."""
+"""The hierarchical agent in the T-maze (thesis 6.4.1): 20 to 60 states, split by what utility tells alone."""
 
 LEARNERS: Mapping[str, AgentConfig] = {
     "hudhmm": HUDHMM,

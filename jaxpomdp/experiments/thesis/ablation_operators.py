@@ -20,18 +20,20 @@ def _without(name: str) -> tuple[str, ...]:
     return tuple(operator for operator in ALL if operator != name)
 
 
+SOBER = {"form": "sober"}
+DIVERSE = {"form": "diverse", "operators": ALL}
 VARIANTS: Mapping[str, Mapping[str, Any]] = {
-    "all operators": {},
-    **{f"without {name} split": {"operators": _without(name)} for name in ALL},
-    "no operator": {"edits_per_phase": 0},
-    "sober tree": {"form": "sober"},
-    "sober tree, without parent split": {"form": "sober", "operators": _without("parent")},
+    "all operators": DIVERSE,
+    **{f"without {name} split": DIVERSE | {"operators": _without(name)} for name in ALL},
+    "no operator": DIVERSE | {"edits_per_phase": 0},
+    "sober tree": DIVERSE | SOBER,
+    "sober tree, without parent split": DIVERSE | SOBER | {"operators": _without("parent")},
 }
-"""Settings of the hierarchical agent."""
+"""Settings of the hierarchical agent; the first tree is diverse where not said otherwise."""
 
 WORLDS = {
     "T-maze, N = 20": (fig_6_7.run(20, "hudhmm-tmaze"), "udhmm-tmaze", fig_6_7.EXPERIMENT.criterion, 60),
-    "89-state maze": (maze89.run("hudhmm", 2000), "udhmm", maze89.CRITERION, 100),
+    "89-state maze": (maze89.run("hudhmm", 2000, theta=0.0), "udhmm", maze89.CRITERION, 100),
 }
 """A run of the hierarchical agent, the flat agent for that world, what a success is, and states at most."""
 FLAT = "flat, as many states"
@@ -49,7 +51,7 @@ def _rows(world: str) -> list[Row]:
 
 def flat_control(base: RunConfig, agent: str, most: int) -> RunConfig:
     """Return the run of a flat agent that may grow to as many states, with the same theta."""
-    same = {"states": 20, "node_cap": most, "edits_per_phase": 2, "theta": 0.2} | dict(base.settings)
+    same = {"states": 20, "node_cap": most, "edits_per_phase": 2} | dict(base.settings)
     return replace(base, agent=agent, settings=tuple(same.items()))
 
 
