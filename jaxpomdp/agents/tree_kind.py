@@ -24,12 +24,16 @@ from jaxpomdp.models.hierarchical import HIERARCHICAL, TreeParams
 from jaxpomdp.models.init import stack_models
 from jaxpomdp.numerics import bucket
 from jaxpomdp.packing import TreeCapacity
+from jaxpomdp.structure.edits import Operator
+from jaxpomdp.structure.leaf_split import LEAF_SPLIT
 from jaxpomdp.structure.operators import TREE_OPERATORS
 from jaxpomdp.structure.tree_evidence import TreeEvidence
 from jaxpomdp.structure.tree_init import Form, tree_over
 from jaxpomdp.structure.tree_tests import TreeSplitConfig
 
-TreeRule = Literal["observation", "brother", "uncle", "parent"]
+TreeRule = Literal["observation", "brother", "uncle", "parent", "leaf"]
+HMO: tuple[TreeRule, ...] = ("observation", "brother", "uncle", "parent")
+"""The Hierarchical Model Operators (thesis 6.3)."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +54,8 @@ class HierarchicalModel:
     """What a branch activates depends on the action that led there."""
     concentration: float = 1.0
     """Of the Dirichlet distributions that the first probabilities are drawn from; large is even."""
-    operators: tuple[TreeRule, ...] = get_args(TreeRule)
-    """Which operators run, in this order."""
+    operators: tuple[TreeRule, ...] = HMO
+    """Which operators run, in this order; ``leaf`` is the flat agent's split (3.3), with its settings."""
     return_bins: int = 16
     """Bins of the returns that operators compare."""
     tests: TreeSplitConfig = field(default_factory=TreeSplitConfig)
@@ -65,8 +69,8 @@ class HierarchicalModel:
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
         for name in self.operators:
-            if name not in TREE_OPERATORS:
-                raise ValueError(f"operators must be of {', '.join(TREE_OPERATORS)}, got {name!r}")
+            if name not in get_args(TreeRule):
+                raise ValueError(f"operators must be of {', '.join(get_args(TreeRule))}, got {name!r}")
         if not self.concentration > 0:
             raise ValueError(f"concentration must be positive, got {self.concentration}")
 
@@ -99,8 +103,14 @@ def _kind(model: HierarchicalModel) -> Kind:
         unpack=packing.unpack_all,
         gather=partial(gather_of_trees, model.return_bins),
         evidence=lambda arrays, s, spec: evidence_of_model(TreeEvidence(*arrays), s, spec.num_states),
-        operators=lambda settings: tuple((TREE_OPERATORS[name], model.tests) for name in model.operators),
+        operators=partial(_operators, model),
     )
+
+
+def _operators(model: HierarchicalModel, settings: LearnerConfig) -> tuple[tuple[Operator, Any], ...]:
+    known = {name: (operator, model.tests) for name, operator in TREE_OPERATORS.items()}
+    known["leaf"] = LEAF_SPLIT, settings.split
+    return tuple(known[name] for name in model.operators)
 
 
 def start_tree(

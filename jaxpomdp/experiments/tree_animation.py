@@ -126,8 +126,8 @@ def edit_title(row: Mapping[str, Any]) -> str:
     'trial 50: uncle split of i2, as s3 differs after i1 and s4 (p = 0.00012): 24 leaves'
     """
     when = f"trial {row['trial']}: " if "trial" in row else ""
-    first, second = row["conditions"]
-    why = f"as s{row['node']} differs after {first} and {second} (p = {row['p_value']:.2g})"
+    after = " and ".join(row.get("conditions", ()))
+    why = f"as s{row['node']} differs{after and ' after '}{after} (p = {row['p_value']:.2g})"
     return f"{when}{row['operator']} split of {row['top']}, {why}: {row['states_after']} leaves"
 
 

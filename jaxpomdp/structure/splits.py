@@ -134,7 +134,7 @@ class StateSplit(NamedTuple):
 
 
 def propose_splits(
-    spec: FlatSpec,
+    spec: Any,
     evidence: ReturnEvidence,
     config: SplitConfig = SplitConfig(),
     allowance: Allowance = UNLIMITED,

@@ -5,26 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from jaxpomdp.agents.tree_kind import TreeRule
+from jaxpomdp.agents.tree_kind import HMO
 from jaxpomdp.experiments.config import RunConfig
 from jaxpomdp.experiments.experiment import Experiment, Measured, Row
 from jaxpomdp.experiments.thesis import fig_6_7, maze89
 from jaxpomdp.experiments.thesis.worlds import plot_held
 
-ALL: tuple[str, ...] = get_args(TreeRule)
-
 
 def _without(name: str) -> tuple[str, ...]:
-    return tuple(operator for operator in ALL if operator != name)
+    return tuple(operator for operator in HMO if operator != name)
 
 
 SOBER = {"form": "sober"}
-DIVERSE = {"form": "diverse", "operators": ALL}
+DIVERSE = {"form": "diverse", "operators": HMO}
 VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "all operators": DIVERSE,
-    **{f"without {name} split": DIVERSE | {"operators": _without(name)} for name in ALL},
+    **{f"without {name} split": DIVERSE | {"operators": _without(name)} for name in HMO},
     "no operator": DIVERSE | {"edits_per_phase": 0},
     "sober tree": DIVERSE | SOBER,
     "sober tree, without parent split": DIVERSE | SOBER | {"operators": _without("parent")},
