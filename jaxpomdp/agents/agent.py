@@ -217,14 +217,15 @@ class Agent:
         policy = settings.policy
         phase = int(np.max(np.asarray(state.actor.trials))) // settings.trials_per_phase - 1
         due = phase >= policy.first_phase and (phase - policy.first_phase) % policy.every == 0
-        alive = np.asarray(state.params.alive)
-        if not due or not policy.edits_per_phase or (held | (alive.sum(-1) >= policy.node_cap)).all():
+        skipped = held | (np.asarray(state.params.alive).sum(-1) >= policy.node_cap)
+        if not due or not policy.edits_per_phase or skipped.all():
             return state, np.zeros(len(held), bool)
+        batch = learner.hidden(batch, jnp.asarray(skipped))
         arrays = jax.device_get(self.kind.gather(state.params, batch, jnp.asarray(trial), settings))
         specs, origins, rests = self.kind.unpack(state.params), [], []
         for s, spec in enumerate(specs):
             rest = state.rest[s, : spec.num_states]
-            if held[s] or spec.num_states >= policy.node_cap:
+            if skipped[s]:
                 origins.append(np.arange(spec.num_states))
                 rests.append(rest)
                 continue

@@ -113,15 +113,17 @@ def with_returns(batch: TrialBatch, tail: Array, *, gamma: float, bootstrap: boo
     return replace(batch, returns=returns)
 
 
+def hidden(batch: TrialBatch, held: Array) -> TrialBatch:
+    """Hide the tapes of the models that are ``held[S]`` from inference, so that these cost nothing."""
+    return replace(batch, valid=batch.valid & ~held[:, None, None])
+
+
 @partial(jax.jit, static_argnames=("family", "config", "iterations"))
 def refit(
     family: Family, params: Any, batch: TrialBatch, held: Array, config: EMConfig, iterations: int
 ) -> tuple[Any, Array]:
-    """Run Baum-Welch on the models that are not held; return the models and their log-evidence ``[S]``.
-
-    A held model's data are hidden from inference, so it costs nothing.
-    """
-    batch = replace(batch, valid=batch.valid & ~held[:, None, None])
+    """Run Baum-Welch on the models that are not held; return the models and their log-evidence ``[S]``."""
+    batch = hidden(batch, held)
 
     def iterate(models: Any, _: None) -> tuple[Any, Array]:
         models, info = em_step(family, models, batch, config)

@@ -56,9 +56,14 @@ def gather_tree_evidence(
     chains, log_obs = jax.vmap(partial(family.learning, theta=config.theta))(params, batch)
     smoothed = e_step(family, params, batch, config)
     belief = filter_chains(chains, log_obs, batch)
-    over = partial(_of_model, num_symbols=num_symbols, bins=bins)
     models = (jnp.exp(chains.log_trans), belief, smoothed.gamma, batch, symbols)
-    return TreeEvidence(smoothed.xi, *jax.lax.map(lambda model: over(*model), models))
+
+    def over(model: tuple[Any, ...]) -> tuple[Array, ...]:
+        count = partial(_of_model, num_symbols=num_symbols, bins=bins)
+        nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(count, *model))
+        return jax.lax.cond(jnp.any(model[3].valid), count, lambda *_: nothing, *model)
+
+    return TreeEvidence(smoothed.xi, *jax.lax.map(over, models))
 
 
 def joint_symbols(observations: Sequence[Array], sizes: Sequence[int]) -> tuple[Array, int]:
