@@ -23,7 +23,7 @@ RESULT = Path(__file__).parents[1] / "results" / "hierarchy" / "cousin.json"
 
 
 def found(seed: int, steps: int, config: TreeSplitConfig) -> dict[str, bool]:
-    """Say who fires on a plant for cousins: the split on the planted leaf, other splits there, any on none."""
+    """Say who fires: the split on a planted leaf, other splits there, and the split where nothing is."""
     spec = world(seed)
     leaf = int(np.random.default_rng(seed).integers(spec.num_states))
     planted = simulate(spec, seed, steps, "cousin", leaf)

@@ -6,7 +6,7 @@ that to all copies. The flat chain gets the same copies, and its rows are shared
 
 The cousin split is the one edit that also writes in the flat chain. No table of a tree can send activity from
 one cousin to a branch and from another, with the same parent, to the branch's copy. So both are remembered
-from then on: activity that heeds them goes as it went, but one leads to the branch, and the other to the copy.
+from then on: activity that heeds them goes as it went, but one leads to the branch, the other to the copy.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def write_memory(
 ) -> CoupledTreeSpec:
     """Let the nodes be remembered, and lead to the copies of some leaves with this share of what led to both.
 
-    A node of which nothing was remembered leads as it does in acting; one that leads already only shares anew.
+    A node that was not heeded leads as its leaf does in acting; one that leads already only shares anew.
 
     Args:
         spec: the model.

@@ -1,7 +1,7 @@
 """The Hierarchical Model Operators on trees (thesis 6.3): observation, brother, uncle and parent split.
 
-The cousin split needs a second, flat chain beside the tree (``coupled_tree_edits``); what it does to the tree
-is here. Each is an ``Operator`` as the flat model's state split; ``Edit.origin`` says which leaf each comes from.
+Each is an ``Operator`` as the flat model's state split; ``Edit.origin`` says which leaf each comes from. What
+the cousin split does to the tree is here too; its memory comes with ``coupled_tree_edits``.
 """
 
 from __future__ import annotations
@@ -156,7 +156,9 @@ def _split(
             shares[conditions.kin] = _of_kin(conditions, given, into)
     names = [name_of(spec, node) if node >= 0 else "entry" for node in (finding.left, finding.right)]
     symbols = _symbols(evidence, finding, conditions, config) if kind == "observation" else None
-    returns = _returns(spec, evidence, finding, conditions) if finding.action >= 0 and kind != "parent" else None
+    returns = (
+        _returns(spec, evidence, finding, conditions) if finding.action >= 0 and kind != "parent" else None
+    )
     return TreeSplit(
         (names[0], names[1]),
         finding.action,
