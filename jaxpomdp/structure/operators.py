@@ -153,7 +153,7 @@ def _split(
         shares[conditions.nodes] = given
         if conditions.kin is not None:
             into = evidence.transitions.sum(0)[:, spec.below[spec.parent[finding.leaf]]].sum(-1)
-            shares[conditions.kin] = _of_kin(conditions, given, into)
+            shares[conditions.kin] = _of_kin(conditions.kin, given, conditions.groups @ into)
     names = [name_of(spec, node) if node >= 0 else "entry" for node in (finding.left, finding.right)]
     symbols = _symbols(evidence, finding, conditions, config) if kind == "observation" else None
     returns = (
@@ -195,13 +195,12 @@ def _given_shares(
     return shares
 
 
-def _of_kin(conditions: Conditions, given: np.ndarray, into: np.ndarray) -> np.ndarray:
+def _of_kin(kin: np.ndarray, given: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Return ``[C]``: the mean share of each condition's kin, by the weight that leads on from them.
 
     It is all that the tree itself can do for cousins: their uncle's connection is one.
     """
-    weight = conditions.groups @ into + 1e-9
-    same = (conditions.kin[:, None] == conditions.kin[None]) * weight
+    same = (kin[:, None] == kin[None]) * (weight + 1e-9)
     return same @ given / same.sum(-1)
 
 
