@@ -38,7 +38,7 @@ def found(seed: int, steps: int, config: TreeSplitConfig) -> dict[str, bool]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--steps", type=int, nargs="+", default=[2000, 6000, 20000])
+    parser.add_argument("--steps", type=int, nargs="+", default=[12_000, 50_000])
     parser.add_argument("--level", type=float, default=0.05)
     arguments = parser.parse_args()
     config, rows = TreeSplitConfig(significance=arguments.level), []
