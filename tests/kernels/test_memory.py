@@ -100,6 +100,22 @@ def test_a_memory_that_always_notes_is_a_second_flat_chain() -> None:
     np.testing.assert_allclose(seen.xi, plain.xi, atol=1e-10)
 
 
+@pytest.mark.usefixtures("x64")
+def test_a_memory_asleep_costs_nothing_and_changes_nothing() -> None:
+    """One of two models is asleep: both plans agree on everything."""
+    problems = [
+        random_memory(s, steps=30, states=4, starts=0.2, missing=0.1, padding=2).jax() for s in range(2)
+    ]
+    sure = jnp.tile(jnp.array([0.0, NEG]), (4, 1))
+    chains = [problems[0][0]._replace(log_heed=sure, log_note=sure), problems[1][0]]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *chains)
+    tapes = [jnp.stack(x)[:, None] for x in zip(*(tape for _, tape in problems), strict=True)]
+    auto, pairs = (memory_posterior(stacked, *tapes, plan=plan) for plan in ("auto", "pairs"))
+    for name, x, y in zip(auto._fields, auto, pairs, strict=True):
+        for left, right in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
+            np.testing.assert_allclose(left, right, atol=1e-10, err_msg=name)
+
+
 def test_many_models_and_tapes_are_each_alone() -> None:
     problems = [[random_memory(2 * s + b, steps=12, starts=0.2, padding=b).jax(np.float32) for b in range(2)]
                 for s in range(3)]  # fmt: skip
