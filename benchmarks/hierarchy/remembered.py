@@ -32,7 +32,7 @@ from jaxpomdp.models.selection import held_out
 from jaxpomdp.packing import pack
 from jaxpomdp.structure.coupled_tree import CoupledTreeSpec, coupled_tree
 from jaxpomdp.structure.coupled_tree_edits import follow, write_memory
-from jaxpomdp.structure.spec import Channel
+from jaxpomdp.structure.spec import Channel, safe_log
 from jaxpomdp.structure.tree import TreeSpec
 from jaxpomdp.structure.tree_edits import branch_leaves, clone_branch
 from jaxpomdp.structure.tree_forms import flatten_tree
@@ -48,11 +48,22 @@ def emitting(tree: TreeSpec, table: np.ndarray) -> TreeSpec:
     return replace(tree, emissions=(Channel("Categorical", {"log_prob": np.log(table)}),))
 
 
+def led(tree: TreeSpec, uncle: int, top: int, share: float = 0.8) -> TreeSpec:
+    """Let the children of the uncle end, and the uncle lead to the branch, with this probability at least."""
+    rows = np.exp(tree.log_horizontal)
+    goals = [(child, tree.num_nodes) for child in tree.children(uncle)] + [(uncle, top)]
+    for node, goal in goals:
+        rows[:, node] *= 1 - share
+        rows[:, node, goal] += share
+    return replace(tree, log_horizontal=safe_log(rows))
+
+
 def grown(seed: int) -> tuple[CoupledTreeSpec, np.ndarray, tuple[int, int]]:
     """Copy the branch of leaf 0; return the model, the branch's leaves, and two cousins of them."""
     tree = random_tree(seed, 9, ACTIONS, SYMBOLS, levels=2, form="sober", concentration=0.3)
     top, found = int(tree.parent[0]), cousins(tree, 0)
     one, other = (int(node) for node in found.nodes[:2])
+    tree = led(tree, int(found.kin[0]), top)
     leaves = branch_leaves(tree, top)
     copy = clone_branch(tree, top, np.full(tree.num_nodes + 1, 0.5))
     table = np.exp(copy.emissions[0].values["log_prob"])
@@ -108,7 +119,8 @@ def below_truth(seed: int, steps: int, keep: float, config: EMConfig) -> dict[st
     keys = jax.random.split(jax.random.key(seed))
     data, unseen = drawn(keys[0], truth, steps), drawn(keys[1], truth, 16 * ROW)
     best = held_out(COUPLED_TREE, pack_coupled_trees([truth], spec.num_states), unseen)
-    scores = {}
+    deaf = held_out(HIERARCHICAL, pack([truth.tree], spec.num_states), unseen)
+    scores = {"truth without memory": float((best - deaf)[0])}
     for name, (family, params) in contestants(spec, leaves, pair).items():
         fitted, _ = fit(family, params, data, config)
         scores[name] = float((best - held_out(family, fitted, unseen))[0])
@@ -117,8 +129,8 @@ def below_truth(seed: int, steps: int, keep: float, config: EMConfig) -> dict[st
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--steps", type=int, nargs="+", default=[2000, 8000, 32_000])
+    parser.add_argument("--runs", type=int, default=12)
+    parser.add_argument("--steps", type=int, nargs="+", default=[8000])
     parser.add_argument("--keep", type=float, nargs="+", default=[0.0, 0.8])
     arguments = parser.parse_args()
     config, rows = EMConfig(iterations=60), []
