@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from jaxpomdp.agents.control import ControlConfig as ControlConfig
     from jaxpomdp.agents.control import Schedule as Schedule
     from jaxpomdp.agents.coupled_kind import CoupledModel as CoupledModel
+    from jaxpomdp.agents.coupled_tree_kind import CoupledTreeModel as CoupledTreeModel
     from jaxpomdp.agents.gym_agent import GymAgent as GymAgent
     from jaxpomdp.agents.kinds import FlatModel as FlatModel
     from jaxpomdp.agents.kinds import Kind as Kind
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from jaxpomdp.agents.policies import evaluate_policy as evaluate_policy
     from jaxpomdp.agents.tree_evidence import gather_tree_evidence as gather_tree_evidence
     from jaxpomdp.coupled_packing import pack_coupled as pack_coupled
+    from jaxpomdp.coupled_packing import pack_coupled_trees as pack_coupled_trees
     from jaxpomdp.coupled_packing import unpack_coupled as unpack_coupled
+    from jaxpomdp.coupled_packing import unpack_coupled_trees as unpack_coupled_trees
     from jaxpomdp.envs.drawing import draw as draw
     from jaxpomdp.envs.hallway import hallway as hallway
     from jaxpomdp.envs.hallway import hallway_navigation as hallway_navigation
@@ -83,6 +86,8 @@ if TYPE_CHECKING:
     from jaxpomdp.models.coupled import CoupledParams as CoupledParams
     from jaxpomdp.models.coupled_init import couple as couple
     from jaxpomdp.models.coupled_init import silent as silent
+    from jaxpomdp.models.coupled_tree import COUPLED_TREE as COUPLED_TREE
+    from jaxpomdp.models.coupled_tree import CoupledTreeParams as CoupledTreeParams
     from jaxpomdp.models.data import trial_batch as trial_batch
     from jaxpomdp.models.em import EMConfig as EMConfig
     from jaxpomdp.models.em import EMReport as EMReport
@@ -116,6 +121,10 @@ if TYPE_CHECKING:
     from jaxpomdp.packing import pack as pack
     from jaxpomdp.packing import unpack as unpack
     from jaxpomdp.structure.coupled_spec import CoupledSpec as CoupledSpec
+    from jaxpomdp.structure.coupled_tree import CoupledTreeSpec as CoupledTreeSpec
+    from jaxpomdp.structure.coupled_tree import coupled_tree as coupled_tree
+    from jaxpomdp.structure.coupled_tree_edits import COUPLED_TREE_OPERATORS as COUPLED_TREE_OPERATORS
+    from jaxpomdp.structure.coupled_tree_edits import CousinSplitConfig as CousinSplitConfig
     from jaxpomdp.structure.evidence import ReturnEvidence as ReturnEvidence
     from jaxpomdp.structure.evidence import return_evidence as return_evidence
     from jaxpomdp.structure.operators import TREE_SPLITS as TREE_SPLITS
@@ -141,12 +150,18 @@ _HOMES = {
     "AgentState": "jaxpomdp.agents.agent",
     "COUPLED_MIXTURE": "jaxpomdp.models.coupled",
     "COUPLED_PRODUCT": "jaxpomdp.models.coupled",
+    "COUPLED_TREE": "jaxpomdp.models.coupled_tree",
+    "COUPLED_TREE_OPERATORS": "jaxpomdp.structure.coupled_tree_edits",
     "Categorical": "jaxpomdp.models.emission",
     "Chain": "jaxpomdp._types",
     "ControlConfig": "jaxpomdp.agents.control",
     "CoupledModel": "jaxpomdp.agents.coupled_kind",
     "CoupledParams": "jaxpomdp.models.coupled",
     "CoupledSpec": "jaxpomdp.structure.coupled_spec",
+    "CoupledTreeModel": "jaxpomdp.agents.coupled_tree_kind",
+    "CoupledTreeParams": "jaxpomdp.models.coupled_tree",
+    "CoupledTreeSpec": "jaxpomdp.structure.coupled_tree",
+    "CousinSplitConfig": "jaxpomdp.structure.coupled_tree_edits",
     "Decoded": "jaxpomdp.kernels.decoding",
     "DiagonalGaussian": "jaxpomdp.models.emission",
     "EMConfig": "jaxpomdp.models.em",
@@ -189,6 +204,7 @@ _HOMES = {
     "beliefs_of_nodes": "jaxpomdp.models.hierarchical",
     "bic": "jaxpomdp.models.selection",
     "couple": "jaxpomdp.models.coupled_init",
+    "coupled_tree": "jaxpomdp.structure.coupled_tree",
     "draw": "jaxpomdp.envs.drawing",
     "e_step": "jaxpomdp.models.em",
     "em_step": "jaxpomdp.models.em",
@@ -222,6 +238,7 @@ _HOMES = {
     "one_level": "jaxpomdp.structure.tree_forms",
     "pack": "jaxpomdp.packing",
     "pack_coupled": "jaxpomdp.coupled_packing",
+    "pack_coupled_trees": "jaxpomdp.coupled_packing",
     "path_of_nodes": "jaxpomdp.models.hierarchical",
     "perseus": "jaxpomdp.kernels.planning",
     "plan": "jaxpomdp.agents.planners",
@@ -254,6 +271,7 @@ _HOMES = {
     "trial_batch": "jaxpomdp.models.data",
     "unpack": "jaxpomdp.packing",
     "unpack_coupled": "jaxpomdp.coupled_packing",
+    "unpack_coupled_trees": "jaxpomdp.coupled_packing",
     "update_belief": "jaxpomdp.kernels.filtering",
     "value_iteration": "jaxpomdp.kernels.planning",
     "viterbi": "jaxpomdp.kernels.decoding",

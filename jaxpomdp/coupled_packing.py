@@ -1,4 +1,7 @@
-"""Coupled specs on the host and padded arrays on the device; as ``packing``, strand by strand."""
+"""Coupled specs on the host and padded arrays on the device; as ``packing``, strand by strand.
+
+A coupled tree is packed as its tree, and the tables of its memory beside it.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +12,12 @@ import jax
 import numpy as np
 
 from jaxpomdp.models.coupled import CoupledParams, Strand
+from jaxpomdp.models.coupled_tree import MEMORY, CoupledTreeParams
 from jaxpomdp.models.emission import ReturnModel
 from jaxpomdp.numerics import NEG
-from jaxpomdp.packing import CHANNELS, slots_of
+from jaxpomdp.packing import CHANNELS, TreeCapacity, pack, slots_of, unpack_all
 from jaxpomdp.structure.coupled_spec import CoupledSpec, StrandSpec
+from jaxpomdp.structure.coupled_tree import CoupledTreeSpec
 from jaxpomdp.structure.spec import Channel
 
 
@@ -49,6 +54,47 @@ def unpack_coupled(params: CoupledParams) -> list[CoupledSpec]:
         raise ValueError(f"params must have a leading axis [S], got alive of shape {params.alive.shape}")
     host = jax.device_get(params)
     return [_spec_of(host, s) for s in range(len(host.alive))]
+
+
+def pack_coupled_trees(specs: Sequence[CoupledTreeSpec], capacity: int | TreeCapacity) -> CoupledTreeParams:
+    """Return coupled trees as one pytree of arrays with leading ``[S]``; the memory has a slot for each leaf.
+
+    The numbers keep their type where the device has it, so ``unpack_coupled_trees`` gives back equal specs.
+
+    Args:
+        specs: the models; their trees may have any shapes.
+        capacity: as for ``packing.pack`` of trees.
+
+    Raises:
+        ValueError: no specs, more states than slots, or trees with other actions, channels or returns.
+    """
+    tree = pack([spec.tree for spec in specs], capacity)
+    leaves = tree.alive.shape[-1]
+    lead, alone = (
+        _padded([getattr(spec, name) for spec in specs], (leaves, leaves))
+        for name in ("log_lead", "log_alone")
+    )
+    slots, _ = slots_of([np.arange(spec.num_states) for spec in specs], leaves)
+    heed, note = (
+        np.stack([getattr(spec, name)[index] for spec, index in zip(specs, slots, strict=True)])
+        for name in MEMORY[1:]
+    )
+    return jax.device_put(CoupledTreeParams(tree, lead, heed, note, alone))
+
+
+def unpack_coupled_trees(params: CoupledTreeParams) -> list[CoupledTreeSpec]:
+    """Return every coupled tree as a spec; the arrays leave the device once.
+
+    Raises:
+        ValueError: the models have no leading axis.
+    """
+    trees, host = unpack_all(params.tree), jax.device_get(params)
+    specs = []
+    for s, tree in enumerate(trees):
+        alive = np.flatnonzero(host.alive[s])
+        lead, alone = (x[s][:, alive][:, :, alive] for x in (host.log_lead, host.log_alone))
+        specs.append(CoupledTreeSpec(tree, lead, host.log_heed[s][alive], host.log_note[s][alive], alone))
+    return specs
 
 
 def _padded(tables: Sequence[np.ndarray], shape: tuple[int, int]) -> np.ndarray:

@@ -46,6 +46,7 @@ from jaxpomdp.structure.tree_tests import (
     activations,
     brothers,
     conditions_of,
+    cousins,
     uncles,
 )
 
@@ -114,7 +115,7 @@ def conditions_for(kind: str, spec: TreeSpec, leaf: int) -> Conditions:
     if kind == "parent":
         even = np.exp(flatten_tree(spec).log_trans)
         return activations(spec, starting_over(spec), leaf, even)
-    return uncles(spec, leaf) if kind == "uncle" else brothers(spec, leaf)
+    return {"uncle": uncles, "cousin": cousins}.get(kind, brothers)(spec, leaf)
 
 
 def draw(

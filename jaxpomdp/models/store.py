@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp.models.coupled import CoupledParams, Strand
+from jaxpomdp.models.coupled_tree import CoupledTreeParams
 from jaxpomdp.models.emission import Categorical, DiagonalGaussian, ReturnModel
 from jaxpomdp.models.flat import FlatParams
 from jaxpomdp.models.full_gaussian import FullGaussian
@@ -35,6 +36,7 @@ KINDS: dict[str, type] = {
         FlatParams,
         TreeParams,
         CoupledParams,
+        CoupledTreeParams,
         Strand,
         Categorical,
         DiagonalGaussian,

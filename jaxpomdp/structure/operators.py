@@ -1,7 +1,7 @@
 """The Hierarchical Model Operators on trees (thesis 6.3): observation, brother, uncle and parent split.
 
-The cousin split needs a second, flat chain beside the tree and comes with the coupled model.
-Each is an ``Operator`` as the flat model's state split; ``Edit.origin`` says which leaf each comes from.
+Each is an ``Operator`` as the flat model's state split; ``Edit.origin`` says which leaf each comes from. What
+the cousin split does to the tree is here too; its memory comes with ``coupled_tree_edits``.
 """
 
 from __future__ import annotations
@@ -151,9 +151,14 @@ def _split(
     if kind != "parent":
         given = _given_shares(evidence, finding, conditions, config)
         shares[conditions.nodes] = given
+        if conditions.kin is not None:
+            into = evidence.transitions.sum(0)[:, spec.below[spec.parent[finding.leaf]]].sum(-1)
+            shares[conditions.kin] = _of_kin(conditions.kin, given, conditions.groups @ into)
     names = [name_of(spec, node) if node >= 0 else "entry" for node in (finding.left, finding.right)]
     symbols = _symbols(evidence, finding, conditions, config) if kind == "observation" else None
-    returns = _returns(spec, evidence, finding, conditions) if kind in ("brother", "uncle") else None
+    returns = (
+        _returns(spec, evidence, finding, conditions) if finding.action >= 0 and kind != "parent" else None
+    )
     return TreeSplit(
         (names[0], names[1]),
         finding.action,
@@ -188,6 +193,15 @@ def _given_shares(
     shares[conditions.nodes == finding.left] = 1 - config.strong
     shares[conditions.nodes == finding.right] = config.strong
     return shares
+
+
+def _of_kin(kin: np.ndarray, given: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return ``[C]``: the mean share of each condition's kin, by the weight that leads on from them.
+
+    It is all that the tree itself can do for cousins: their uncle's connection is one.
+    """
+    same = (kin[:, None] == kin[None]) * (weight + 1e-9)
+    return same @ given / same.sum(-1)
 
 
 def _of_pair(conditions: Conditions, finding: Finding) -> np.ndarray:

@@ -59,10 +59,12 @@ class Conditions(NamedTuple):
     """The previous activity that a test of one leaf tells apart: ``nodes[C]`` (-1: the parent's entry).
 
     ``groups[C, N+1]`` holds the weight in each condition of each previous leaf, and of the start of a trial.
+    Where ``kin[C]`` is given, only conditions of equal kin are compared.
     """
 
     nodes: np.ndarray
     groups: np.ndarray
+    kin: np.ndarray | None = None
 
 
 class Finding(NamedTuple):
@@ -96,6 +98,18 @@ def uncles(spec: TreeSpec, leaf: int) -> Conditions:
     return Conditions(siblings, _without_starts(spec.below[siblings]))
 
 
+def cousins(spec: TreeSpec, leaf: int) -> Conditions:
+    """Return the children of a leaf's uncles, each the kin of its brothers.
+
+    Cousins of different uncles are not compared: the tree can tell uncles apart.
+    """
+    above = uncles(spec, leaf).nodes
+    children = [spec.children(int(uncle)) for uncle in above]
+    nodes = np.concatenate([np.zeros(0, int), *children])
+    kin = np.repeat(above, [len(each) for each in children])
+    return Conditions(nodes, _without_starts(spec.below[nodes]), kin)
+
+
 def activations(spec: TreeSpec, over: np.ndarray, leaf: int, transitions: np.ndarray) -> Conditions:
     """Return a leaf's parent as activated by itself and by another node (the root: by a trial's start).
 
@@ -127,7 +141,8 @@ def conditions_of(
     if kind == "parent":
         over = starting_over(spec)
         return {leaf: activations(spec, over, leaf, evidence.transitions) for leaf in leaves}
-    return {leaf: (uncles if kind == "uncle" else brothers)(spec, leaf) for leaf in leaves}
+    find = {"uncle": uncles, "cousin": cousins}.get(kind, brothers)
+    return {leaf: find(spec, leaf) for leaf in leaves}
 
 
 def findings(
@@ -154,7 +169,8 @@ def _tests(
     evidence: TreeEvidence, leaf: int, conditions: Conditions, config: TreeSplitConfig, seen: bool
 ) -> Iterator[Finding]:
     table = evidence.symbols[:, :, None] if seen else evidence.returns
-    pairs = list(combinations(range(len(conditions.nodes)), 2))
+    kin = np.zeros(len(conditions.nodes)) if conditions.kin is None else conditions.kin
+    pairs = [(i, j) for i, j in combinations(range(len(kin)), 2) if kin[i] == kin[j]]
     if not pairs:
         return
     left, right = np.array(pairs).T

@@ -1,0 +1,97 @@
+"""Coupled hierarchies as a kind of model for agents: HUDHMM with a memory beside it (thesis 6.3.5).
+
+An agent acts, and keeps its values, by the leaves alone. All operators of trees edit both chains, and the
+cousin split writes the memory. What they compare is gathered from the leaves as the chain that acts, which is
+flat, and so knows of every leaf before, whatever the tree says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+
+from jaxpomdp import packing
+from jaxpomdp._types import Array, TrialBatch
+from jaxpomdp.agents import learner
+from jaxpomdp.agents.kinds import Kind, Room, Sizes
+from jaxpomdp.agents.learner import LearnerConfig
+from jaxpomdp.agents.tree_evidence import evidence_of_model, gather_tree_evidence
+from jaxpomdp.agents.tree_kind import HierarchicalModel, room_of_trees, start_tree, tree_room
+from jaxpomdp.coupled_packing import pack_coupled_trees, unpack_coupled_trees
+from jaxpomdp.models.coupled_tree import COUPLED_TREE, LEAVES_ALONE, CoupledTreeParams
+from jaxpomdp.models.init import stack_models
+from jaxpomdp.packing import TreeCapacity
+from jaxpomdp.structure.coupled_tree import coupled_tree
+from jaxpomdp.structure.coupled_tree_edits import COUPLED_TREE_OPERATORS, COUSIN_SPLIT, CousinSplitConfig
+from jaxpomdp.structure.tree_evidence import TreeEvidence
+
+
+@dataclass(frozen=True)
+class CoupledTreeModel:
+    """A tree of states, and a flat chain that remembers some of them.
+
+    Raises:
+        ValueError: a setting is out of its range, or a name is unknown.
+    """
+
+    tree: HierarchicalModel = field(default_factory=HierarchicalModel)
+    """The first tree, and which of a tree's operators run, and when."""
+    cousin: bool = True
+    """Whether the cousin split runs, after the others."""
+    keep: float = 0.1
+    """Probability at the start that a cousin is still remembered a step later."""
+
+    def __post_init__(self) -> None:
+        """Refuse settings out of range."""
+        CousinSplitConfig(self.tree.tests, self.keep)
+
+    def kind(self) -> Kind:
+        """Return the functions of this kind."""
+        return _kind(self)
+
+
+@lru_cache
+def _kind(model: CoupledTreeModel) -> Kind:
+    return Kind(
+        family=COUPLED_TREE,
+        start=partial(_start, model),
+        room=lambda settings, specs: tree_room(settings, [spec.tree for spec in specs]),
+        room_of=lambda params: room_of_trees(params.tree),
+        pack=lambda specs, room: pack_coupled_trees(specs, TreeCapacity(*room)),
+        unpack=unpack_coupled_trees,
+        gather=partial(_gather, model.tree.return_bins),
+        evidence=lambda arrays, s, spec: evidence_of_model(TreeEvidence(*arrays), s, spec.num_states),
+        operators=lambda settings: operators_of(model),
+    )
+
+
+def operators_of(model: CoupledTreeModel) -> tuple[tuple[Any, Any], ...]:
+    """Return the operators and their settings, in order: those of the tree, then the cousin split."""
+    tests = model.tree.tests
+    lifted = tuple((COUPLED_TREE_OPERATORS[name], tests) for name in model.tree.operators)
+    return (*lifted, *(((COUSIN_SPLIT, CousinSplitConfig(tests, model.keep)),) if model.cousin else ()))
+
+
+def _start(
+    model: CoupledTreeModel,
+    seed: int,
+    sizes: Sizes,
+    settings: LearnerConfig,
+    room: Room,
+    batch: TrialBatch | None = None,
+) -> CoupledTreeParams:
+    """Start as a tree, with a memory that nothing heeds yet."""
+    tree = packing.unpack(stack_models([start_tree(model.tree, seed, sizes, settings, room, batch)]), 0)
+    packed = pack_coupled_trees([coupled_tree(tree)], TreeCapacity(*room))
+    return jax.tree.map(lambda x: x[0], packed)
+
+
+def _gather(
+    bins: int, params: CoupledTreeParams, batch: TrialBatch, trial: Array, settings: LearnerConfig
+) -> TreeEvidence:
+    symbols = params.tree.emissions[0].log_prob.shape[-1]
+    config = learner.em_config(settings)
+    return gather_tree_evidence(LEAVES_ALONE, params, batch, batch.observations[0], config, symbols, bins)
