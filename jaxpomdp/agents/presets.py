@@ -9,6 +9,7 @@ from typing import Any
 from jaxpomdp.agents.agent import Agent, AgentConfig
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.coupled_kind import CoupledModel
+from jaxpomdp.agents.coupled_tree_kind import CoupledTreeModel
 from jaxpomdp.agents.learner import LearnerConfig
 from jaxpomdp.agents.settings import with_settings
 from jaxpomdp.agents.tree_kind import HierarchicalModel
@@ -131,8 +132,16 @@ HUDHMM_TMAZE = AgentConfig(
 )
 """The hierarchical agent in the T-maze (thesis 6.4.1): 20 to 60 states, split by what utility tells alone."""
 
+
+def with_memory(base: AgentConfig) -> AgentConfig:
+    """Return a hierarchical agent with a flat chain coupled to its tree (thesis 6.3.5)."""
+    return replace(base, model=CoupledTreeModel(base.model))
+
+
 LEARNERS: Mapping[str, AgentConfig] = {
     "hudhmm": HUDHMM,
+    "hudhmm-coupled": with_memory(HUDHMM),
+    "hudhmm-coupled-tmaze": with_memory(HUDHMM_TMAZE),
     "hudhmm-tmaze": HUDHMM_TMAZE,
     "cudhmm": CUDHMM,
     "cudhmm-mixture": coupled(HALLWAY, node_cap=30, return_cap=8, coupling="mixture", added="components"),
