@@ -121,16 +121,16 @@ HUDHMM = AgentConfig(
 
 HUDHMM_TMAZE = AgentConfig(
     TMAZE.control,
-    replace(
-        TMAZE.learner,
-        states=20,
-        policy=PolicyConfig(node_cap=60, edits_per_phase=2, every=3, order="rotate"),
-    ),
+    replace(TMAZE.learner, policy=PolicyConfig(node_cap=30, edits_per_phase=1, order="rotate")),
     HierarchicalModel(
-        vertical_by_action=True, operators=("uncle", "brother"), tests=TreeSplitConfig(stay=0.9)
+        levels=1,
+        vertical_by_action=True,
+        operators=("leaf", "uncle", "parent", "brother"),
+        return_bins=32,
+        tests=TreeSplitConfig(stay=0.9),
     ),
 )
-"""The hierarchical agent in the T-maze (thesis 6.4.1): 20 to 60 states, split by what utility tells alone."""
+"""The hierarchical agent in the T-maze (thesis 6.4.1): from one level, split by what utility tells alone."""
 
 
 def with_memory(base: AgentConfig) -> AgentConfig:
