@@ -66,7 +66,7 @@ EXPERIMENT = Experiment(
     criterion=fig_3_7.CRITERION,
     notes=(
         "The thesis says that its hierarchical agent does better than its flat one. HMO-HUDHMM is as there: "
-        "from 20 production states in up to three levels, with the four operators; at its best it starts from "
+        "from 20 production states in up to three levels, with four operators; at its best it starts from "
         "one level of 8 states, and splits a leaf also as the flat agent does. A run holds when its last two "
         "greedy evaluations take the right arm in at least 95 % of trials."
     ),
