@@ -25,7 +25,8 @@ from jaxpomdp.models.coupled_tree import COUPLED_TREE, LEAVES_ALONE, CoupledTree
 from jaxpomdp.models.init import stack_models
 from jaxpomdp.packing import TreeCapacity
 from jaxpomdp.structure.coupled_tree import coupled_tree
-from jaxpomdp.structure.coupled_tree_edits import COUPLED_TREE_OPERATORS, COUSIN_SPLIT, CousinSplitConfig
+from jaxpomdp.structure.coupled_tree_edits import COUSIN_SPLIT, CousinSplitConfig, lifted
+from jaxpomdp.structure.edits import Operator
 from jaxpomdp.structure.tree_evidence import TreeEvidence
 
 
@@ -64,15 +65,15 @@ def _kind(model: CoupledTreeModel) -> Kind:
         unpack=unpack_coupled_trees,
         gather=partial(_gather, model.tree.return_bins),
         evidence=lambda arrays, s, spec: evidence_of_model(TreeEvidence(*arrays), s, spec.num_states),
-        operators=lambda settings: operators_of(model),
+        operators=partial(_operators, model),
     )
 
 
-def operators_of(model: CoupledTreeModel) -> tuple[tuple[Any, Any], ...]:
-    """Return the operators and their settings, in order: those of the tree, then the cousin split."""
-    tests = model.tree.tests
-    lifted = tuple((COUPLED_TREE_OPERATORS[name], tests) for name in model.tree.operators)
-    return (*lifted, *(((COUSIN_SPLIT, CousinSplitConfig(tests, model.keep)),) if model.cousin else ()))
+def _operators(model: CoupledTreeModel, settings: LearnerConfig) -> tuple[tuple[Operator, Any], ...]:
+    """Return the operators with their settings: the tree's, made in both chains, and the cousin split."""
+    both = [(lifted(operator), config) for operator, config in model.tree.kind().operators(settings)]
+    cousin = COUSIN_SPLIT, CousinSplitConfig(model.tree.tests, model.keep)
+    return (*both, cousin) if model.cousin else tuple(both)
 
 
 def _start(

@@ -153,7 +153,7 @@ def _split(
         shares[conditions.nodes] = given
         if conditions.kin is not None:
             into = evidence.transitions.sum(0)[:, spec.below[spec.parent[finding.leaf]]].sum(-1)
-            shares[conditions.kin] = _of_kin(conditions.kin, given, conditions.groups @ into)
+            shares[conditions.kin] = _of_kin(conditions.kin, given, conditions.groups[:, :-1] @ into)
     names = [name_of(spec, node) if node >= 0 else "entry" for node in (finding.left, finding.right)]
     symbols = _symbols(evidence, finding, conditions, config) if kind == "observation" else None
     returns = (

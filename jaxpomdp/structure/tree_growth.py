@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxpomdp.structure.topology import below, parents_of
 
-BRANCHES = ("observation", "brother", "uncle", "leaf")
+BRANCHES = ("observation", "brother", "uncle", "cousin", "leaf")
 """Operators that copy a branch (or a leaf); ``parent`` adds a level."""
 
 

@@ -194,7 +194,7 @@ def test_cousins_are_children_of_one_uncle() -> None:
     spec = thesis_tree()
     found = cousins(spec, 0)
     assert (found.nodes.tolist(), found.kin.tolist()) == ([2, 3], [7, 7])
-    assert found.groups.astype(int).tolist() == [[0, 0, 1, 0, 0], [0, 0, 0, 1, 0]]
+    assert found.groups.astype(int).tolist() == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]]
     assert len(cousins(spec, 4).nodes) == 0
     deep = make_tree(3, 9, 4)
     for leaf in range(9):
