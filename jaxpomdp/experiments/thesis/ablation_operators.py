@@ -30,8 +30,8 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
 """Settings of the hierarchical agent; the first tree is diverse where not said otherwise."""
 
 WORLDS = {
-    "T-maze, N = 20": (
-        fig_6_7.run(20, "hudhmm-tmaze", **fig_6_7.AS_THE_THESIS),
+    "T-maze, N = 10": (
+        replace(fig_6_7.run(10, "hudhmm-tmaze", **fig_6_7.AS_THE_THESIS), trials=1000),
         "udhmm-tmaze",
         fig_6_7.EXPERIMENT.criterion,
         60,

@@ -12,7 +12,7 @@ from jaxpomdp.experiments.thesis import fig_3_7, fig_6_7, maze89
 from jaxpomdp.experiments.thesis.worlds import plot_held
 
 WORLDS = {
-    "T-maze, N = 20": (fig_6_7.run(20, "hudhmm-tmaze"), "hudhmm-coupled-tmaze", fig_3_7.CRITERION),
+    "T-maze, N = 10": (fig_6_7.run(10, "hudhmm-tmaze"), "hudhmm-coupled-tmaze", fig_3_7.CRITERION),
     "89-state maze": (maze89.run("hudhmm", 1000, theta=0.0), "hudhmm-coupled", maze89.CRITERION),
 }
 """A run of the hierarchical agent, its coupled kind, and what a success is."""
