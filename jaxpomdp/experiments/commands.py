@@ -260,8 +260,8 @@ class Reproduce:
     """
 
     names: tuple[str, ...]
-    """table-3.1, table-6.1, fig-3.4, fig-3.5, fig-3.7, fig-3.9, fig-3.10, fig-6.7, ablation-operators, coupled,
-    coupled-hierarchy, one-theta, or all."""
+    """table-3.1, table-6.1, fig-3.4, fig-3.5, fig-3.7, fig-3.9, fig-3.10, fig-6.7, ablation-operators,
+    coupled, coupled-hierarchy, one-theta, or all."""
     seeds: int = 21
     """Runs of each row."""
     first_seed: int = 1000
