@@ -118,19 +118,23 @@ def hidden(batch: TrialBatch, held: Array) -> TrialBatch:
     return replace(batch, valid=batch.valid & ~held[:, None, None])
 
 
-@partial(jax.jit, static_argnames=("family", "config", "iterations"))
+@partial(jax.jit, static_argnames=("family", "config"))
 def refit(
     family: Family, params: Any, batch: TrialBatch, held: Array, config: EMConfig, iterations: int
 ) -> tuple[Any, Array]:
-    """Run Baum-Welch on the models that are not held; return the models and their log-evidence ``[S]``."""
+    """Run Baum-Welch on the models that are not held; return the models and their log-evidence ``[S]``.
+
+    The number of iterations is data: phases with and without a split share what was compiled.
+    """
     batch = hidden(batch, held)
 
-    def iterate(models: Any, _: None) -> tuple[Any, Array]:
-        models, info = em_step(family, models, batch, config)
+    def iterate(_: int, carry: tuple[Any, Array]) -> tuple[Any, Array]:
+        models, info = em_step(family, carry[0], batch, config)
         return models, jnp.sum(info.log_evidence, axis=-1)
 
-    fitted, evidence = jax.lax.scan(iterate, params, None, length=iterations)
-    return select(held, params, fitted), evidence[-1]
+    nothing = jnp.zeros(len(held), batch.rewards.dtype)
+    fitted, evidence = jax.lax.fori_loop(0, iterations, iterate, (params, nothing))
+    return select(held, params, fitted), evidence
 
 
 @partial(jax.jit, static_argnames=("family", "config", "bins", "by_trial"))
