@@ -82,10 +82,13 @@ def show_tree(path: Path, found: Restored, index: int, tree: TreeSpec, out: Path
     first = packing.unpack(found.agent.init(np.asarray(seeds)).params, index)
     rows = [row for row in read_lines(path / "edits.jsonl") if row["seed"] == seeds[index]]
     try:
-        shapes = grown_to(shape_of(first), shape_of(tree), rows)
+        steps = grown_to(shape_of(first), shape_of(tree), rows)
     except ValueError as error:
         return [*lines, f"no growth.gif: {error} (did it begin again on the way?)"]
-    titles = [f"at the start: {first.num_states} leaves", *map(edit_title, rows[: len(shapes) - 1])]
+    titles = [
+        edit_title(step.row) if step.row else f"at the start: {first.num_states} leaves" for step in steps
+    ]
+    shapes = [step.shape for step in steps]
     film = growth_animation(shapes, titles, out / "growth.gif", names=symbol_names(tree, names))
     return [*lines, f"{film}: its {len(shapes) - 1} edits"]
 

@@ -7,6 +7,7 @@ is to know of the shape at every moment.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -99,17 +100,41 @@ def replayed(shape: Shape, rows: Iterable[Mapping[str, Any]]) -> list[Shape]:
     return shapes
 
 
-def grown_to(first: Shape, last: Shape, rows: Iterable[Mapping[str, Any]]) -> list[Shape]:
-    """Return the shapes of a tree from the first to the last; rows after that are left out.
+class Step(NamedTuple):
+    """A shape on the way from one tree to another, and the logged edit that made it; None for the first."""
+
+    shape: Shape
+    row: Mapping[str, Any] | None
+
+
+def grown_to(first: Shape, last: Shape, rows: Iterable[Mapping[str, Any]]) -> list[Step]:
+    """Return how the last tree grew from the first; edits of trees that were given up are left out.
+
+    An agent may go back to an earlier tree and grow that one, which the log does not say. So an edit is taken
+    to be of the latest tree that it fits, most often the one before it.
 
     Raises:
-        ValueError: the rows do not lead there, as where the model began again on the way.
+        ValueError: the rows do not lead there, as where an agent began again with another tree.
     """
-    shapes = replayed(first, rows)
-    same = [all(map(np.array_equal, shape, last)) for shape in shapes]
-    if not any(same):
+    steps, before = [Step(first, None)], [-1]
+    for row in rows:
+        at, shape = _latest_fitting([step.shape for step in steps], row)
+        steps.append(Step(shape, row))
+        before.append(at)
+    ends = [k for k, step in enumerate(steps) if all(map(np.array_equal, step.shape, last))]
+    if not ends:
         raise ValueError("the logged edits do not lead from the first tree to the last")
-    return shapes[: len(same) - same[::-1].index(True)]
+    way = [ends[-1]]
+    while before[way[0]] >= 0:
+        way.insert(0, before[way[0]])
+    return [steps[k] for k in way]
+
+
+def _latest_fitting(shapes: list[Shape], row: Mapping[str, Any]) -> tuple[int, Shape]:
+    for at in reversed(range(len(shapes))):
+        with suppress(ValueError):
+            return at, _after(shapes[at], row)
+    raise ValueError(f"the logged edit of {row['top']} fits no tree before it")
 
 
 def _after(shape: Shape, row: Mapping[str, Any]) -> Shape:

@@ -125,7 +125,7 @@ class GrowingTree(StillAgent):
         specs = []
         for s, spec in enumerate(unpack_all(state.params)):
             halves = np.full(spec.num_states, 0.5), np.full(spec.num_internal, 0.5)
-            split = TreeSplit(("s1", "entry"), -1, (True, 1), *halves, 0.5, None, None, 0.9)
+            split = TreeSplit(("s1", "entry"), -1, (True, 1), *halves, 0.5, None, None, 0.9, None)
             edit = Edit("brother", 1, spec.num_states, (1,), 9.0, 9.0, 0.001, 0.5, 99.0, split)
             specs.append(BROTHER_SPLIT.apply(spec, edit))
             self.log.append({"seed_index": s} | edit.row())

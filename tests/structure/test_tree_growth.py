@@ -38,8 +38,23 @@ def test_the_log_replayed_on_the_first_tree_gives_the_last(seed: int) -> None:
     for got, wanted in zip(shapes[-1], shape_of(last), strict=True):
         np.testing.assert_array_equal(got, wanted)
     assert [len(shape.leaf_parent) for shape in shapes[1:]] == [row["states_after"] for row in rows]
-    middle = shapes[len(rows) // 2]
-    assert len(grown_to(shape_of(first), middle, rows)) == len(rows) // 2 + 1
+    middle = len(rows) // 2
+    steps = grown_to(shape_of(first), shapes[middle], rows)
+    assert [step.row for step in steps] == [None, *rows[:middle]]
+
+
+def test_edits_of_trees_that_were_given_up_are_left_out() -> None:
+    """The agent goes back to the tree after two edits, and grows that one by others."""
+    first, _, rows = grown(0)
+    shapes = replayed(shape_of(first), rows)
+    back = shapes[2]
+    again = {"operator": "brother", "top": "s0", "states_before": len(back.leaf_parent)}
+    again["states_after"] = again["states_before"] + 1
+    last = replayed(back, [again])[-1]
+    steps = grown_to(shape_of(first), last, [*rows, again])
+    assert [step.row for step in steps] == [None, *rows[:2], again]
+    given_up = grown_to(shape_of(first), shapes[-1], [*rows, again])
+    assert len(given_up) == len(rows) + 1, "and the tree before going back is found as well"
 
 
 def test_all_operators_are_among_those_replayed() -> None:
@@ -51,6 +66,8 @@ def test_another_log_does_not_lead_there() -> None:
     first, last, rows = grown(0)
     with pytest.raises(ValueError, match="do not lead from the first tree"):
         grown_to(shape_of(first), Shape(last.leaf_parent[::-1], last.node_parent), rows)
+    with pytest.raises(ValueError, match="of s0 fits no tree before it"):
+        grown_to(shape_of(first), shape_of(last), [rows[0] | {"top": "s0", "states_before": 50}])
     with pytest.raises(ValueError, match="must fit a tree of 9 leaves"):
         replayed(shape_of(first), rows[1:])
     with pytest.raises(ValueError, match=r"must make \d+ leaves, got"):
