@@ -21,11 +21,11 @@ from jaxpomdp.structure.coupled_tree import validate_coupled_tree
 WORLD = hallway_navigation(step_limit=20)
 SEEDS = (5, 6)
 SETTINGS = {
-    "schedule": Schedule(1.0, 0.2, 9000),
+    "schedule": Schedule(1.0, 0.5, 30000),
     "states": 9,
     "node_cap": 14,
-    "window": 300,
-    "trials_per_phase": 150,
+    "window": 800,
+    "trials_per_phase": 400,
     "edits_per_phase": 1,
     "order": "rotate",
     "operators": ("brother",),
@@ -59,7 +59,7 @@ def assert_equal(one, other):
 @pytest.fixture(scope="module")
 def run():
     agent = small()
-    return agent, rounds(agent, 3)
+    return agent, rounds(agent, 2)
 
 
 def test_edits_keep_all_laws(run):
