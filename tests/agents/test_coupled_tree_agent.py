@@ -79,12 +79,17 @@ def test_edits_keep_all_laws(run):
             assert np.isfinite(np.asarray(leaf)).all()
 
 
-def test_cousin_splits_write_the_memory(run):
+def test_nothing_but_cousin_splits_writes_the_memory(run):
     agent, states = run
-    splits = [row for row in agent.log if row["operator"] == "cousin"]
-    assert splits
+    split = {row["seed_index"] for row in agent.log if row["operator"] == "cousin"}
     for s, spec in enumerate(agent.kind.unpack(states[-1].params)):
-        assert spec.heeded.any() == (s in {row["seed_index"] for row in splits})
+        assert spec.heeded.any() == (s in split)
+
+
+def test_the_operators_are_the_trees_and_the_cousin_split():
+    agent = small(operators=("uncle", "leaf"))
+    kinds = [operator.kind for operator, _ in agent.kind.operators(agent.config.learner)]
+    assert kinds == ["uncle", "leaf", "cousin"]
 
 
 def test_a_run_repeats_and_a_saved_state_goes_on(run):
