@@ -27,6 +27,7 @@ SETTINGS = {
     "tests.minimum_weight": 1.0,
     "tests.significance": 1.0,
     "tests.correction": "none",
+    "order": "rotate",
     "return_by_action": False,
     "keep_best": 30,
     "gate": 0.0,
@@ -81,8 +82,8 @@ def test_a_saved_state_goes_on_to_the_same_result(run):
 
 def test_every_edit_is_logged_with_its_evidence(run):
     for row in run[0].log:
-        assert row["operator"] in ("observation", "brother", "uncle", "parent")
-        assert {"node", "conditions", "statistic", "p_value", "weight", "top", "copied"} <= set(row)
+        assert row["operator"] in ("leaf", "observation", "brother", "uncle", "parent")
+        assert {"node", "statistic", "p_value", "weight", "top", "copied"} <= set(row)
         assert np.isfinite([row["log_evidence_before"], row["log_evidence_after"]]).all()
 
 
@@ -111,7 +112,7 @@ def test_the_first_tree_may_be_given():
 
 
 def test_a_sober_tree_has_two_levels():
-    agent = small(form="sober", states=9)
+    agent = small(form="sober", states=9, levels=2)
     for spec in agent.kind.unpack(agent.init(SEEDS).params):
         assert spec.depth.max() == 2
 
@@ -131,10 +132,10 @@ def test_bad_settings_are_refused(settings, message):
 
 
 def test_it_learns_the_t_maze():
-    """Five of six seeds take the right arm at the end: a hidden bit is carried through a tree."""
+    """Three of four seeds take the right arm at the end: a hidden bit is carried through a tree."""
     agent = make_agent("hudhmm-tmaze", tmaze(4))
-    state = agent.init(range(6))
-    for _ in range(120):
+    state = agent.init(range(4))
+    for _ in range(60):
         state, _ = agent.run(state)
     judged = agent.evaluate(agent.finish(state), 50, jax.random.key(1))
-    assert (judged["success"].mean(1) >= 0.95).sum() >= 4
+    assert (judged["success"].mean(1) >= 0.95).sum() >= 3

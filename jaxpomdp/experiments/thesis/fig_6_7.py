@@ -22,6 +22,7 @@ AS_THE_THESIS: dict[str, Any] = {
     "operators": HMO,
     "edits_per_phase": 2,
     "every": 3,
+    "order": "rotate",
 }
 """Section 6.4.1: a random tree of 20 production states in up to three levels, growing to 60."""
 
