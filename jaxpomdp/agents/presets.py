@@ -121,7 +121,7 @@ HUDHMM = AgentConfig(
 
 HUDHMM_TMAZE = AgentConfig(
     TMAZE.control,
-    TMAZE.learner,
+    replace(TMAZE.learner, policy=PolicyConfig(node_cap=20, edits_per_phase=1, order="rotate")),
     HierarchicalModel(
         levels=1,
         vertical_by_action=True,
@@ -130,7 +130,7 @@ HUDHMM_TMAZE = AgentConfig(
         tests=TreeSplitConfig(stay=0.9),
     ),
 )
-"""The hierarchical agent in the T-maze (thesis 6.4.1): from one level, leaves first split as the flat agent's."""
+"""The hierarchical agent in the T-maze (thesis 6.4.1): one level at first, leaves also split as flat ones."""
 
 
 def with_memory(base: AgentConfig) -> AgentConfig:
