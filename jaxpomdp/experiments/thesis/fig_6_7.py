@@ -67,8 +67,8 @@ EXPERIMENT = Experiment(
     notes=(
         "The thesis says that its hierarchical agent does better than its flat one. HMO-HUDHMM is as there: "
         "from 20 production states in up to three levels, with four operators in turn; at its best it starts "
-        "from one level of 8 states, and splits a leaf first as the flat agent does, so that little hierarchy "
-        "is left. A run holds when its last two greedy evaluations take the right arm in at least 95 % of "
+        "from one level of 8 states, and splits a leaf first as the flat agent does: little hierarchy is left. "
+        "A run holds when its last two greedy evaluations take the right arm in at least 95 % of "
         "trials."
     ),
 )

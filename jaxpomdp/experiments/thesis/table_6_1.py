@@ -29,7 +29,7 @@ EXPERIMENT = Experiment(
     columns=table_3_1.EXPERIMENT.columns,
     plot=table_3_1.plot,
     notes=(
-        "The hierarchical agents start from a random tree of 20 production states in up to three levels. "
+        "The hierarchical agents start from a random tree of 20 production states in two levels. "
         "`jaxpomdp play` is how the human row is made. RL-LSTM is Bakker's (2004), as published; it is not "
         "run here."
     ),
