@@ -66,9 +66,8 @@ EXPERIMENT = Experiment(
     criterion=fig_3_7.CRITERION,
     notes=(
         "The thesis says that its hierarchical agent does better than its flat one. HMO-HUDHMM is as there: "
-        "from 20 production states in up to three levels, with four operators in turn; at its best it starts "
-        "from one level of 8 states, and splits a leaf first as the flat agent does: little hierarchy is left. "
-        "A run holds when its last two greedy evaluations take the right arm in at least 95 % of "
-        "trials."
+        "from 20 production states in up to three levels, with four operators in turn. At its best it starts "
+        "from one level of 8 states and first splits leaves as the flat agent does, so little hierarchy is "
+        "left. A run holds when its last two greedy tests take the right arm in at least 95 % of trials."
     ),
 )
