@@ -146,7 +146,9 @@ def followed(config: AgentConfig, seeds: list[int], trials: int, every: int) -> 
         if done % every == 0:
             latest = np.concatenate(steps, axis=1)[:, -every:].mean(axis=1)
             found = measured(agent, state) | {"steps": latest, "states": phase["states"]}
-            rows.append({"trials": done} | {k: np.asarray(v).round(4).tolist() for k, v in found.items()})
+            rows.append(
+                {"trials": done} | {k: np.round(np.asarray(v, float), 4).tolist() for k, v in found.items()}
+            )
     return rows
 
 
@@ -154,7 +156,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
     """Return a line about the last checkpoint: medians over seeds."""
     last = {name: np.median(value) for name, value in rows[-1].items() if name not in ("trials", "held")}
     text = ", ".join(f"{name} {value:.3f}" for name, value in last.items())
-    return f"held {sum(rows[-1]['held'])} of {len(rows[-1]['held'])}, {text}"
+    return f"held {int(sum(rows[-1]['held']))} of {len(rows[-1]['held'])}, {text}"
 
 
 def main() -> None:
