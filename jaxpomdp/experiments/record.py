@@ -7,6 +7,7 @@
     trials.csv        a row per seed and training trial
     phases.csv        a row per seed and phase of the agent
     edits.jsonl       an object per structure edit
+    edits-judged.jsonl  the same with the reward of the trials before and after, once the run is complete
     evaluations.csv   a row per seed and greedy evaluation
     final.csv         a row per seed and greedy trial of the agent as it ended
     checkpoint.npz    the agent's whole state, and how much of each table belongs to it
@@ -104,8 +105,10 @@ class RunDirectory:
         meta = {"progress": dict(progress), "tables": self._marks}
         save_arrays(self.path / "checkpoint.npz", flatten(state), meta)
 
-    def finish(self, state: Any, rows: Rows, summary: Mapping[str, Any]) -> None:
-        """Write the agent as it ended, its last greedy trials, and the summary, which says so."""
+    def finish(self, state: Any, rows: Rows, summary: Mapping[str, Any], edits: Rows = ()) -> None:
+        """Write the agent as it ended, its last trials, its edits as judged, and the summary, which says so."""
+        if edits:
+            write_atomically(self.path / "edits-judged.jsonl", lines_text(edits).encode())
         save_arrays(self.path / "model.npz", flatten(state), {})
         write_atomically(self.path / "final.csv", table_text([FINAL_COLUMNS, *rows]).encode())
         write_json(self.path / "summary.json", dict(summary))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -60,6 +61,32 @@ def edit_row(seeds: Sequence[int], trial: int, edit: Mapping[str, Any]) -> dict[
     """
     rest = {"draw_seed" if name == "seed" else name: x for name, x in edit.items() if name != "seed_index"}
     return {"seed": seeds[edit["seed_index"]], "trial": trial} | rest
+
+
+def judged_edits(run: RunData) -> list[dict[str, Any]]:
+    """Return the structure edits of a run with how the agent did in the phase before each, and in that after.
+
+    ``discounted_before`` and ``discounted_after`` are means over a phase's trials of the discounted reward
+    that the seed collected, exploring; None after the last phase.
+    """
+    file = run.path / "edits.jsonl"
+    if not file.exists() or not run.phases:
+        return []
+    width = int(run.phases["trial"][0, 0])
+    rows = [json.loads(line) for line in file.read_text().splitlines()]
+
+    def reward(edit: Mapping[str, Any], begin: int) -> float | None:
+        trials = run.trials["discounted"][run.seeds.index(edit["seed"]), begin : begin + width]
+        return float(trials.mean()) if trials.size else None
+
+    return [
+        row
+        | {
+            "discounted_before": reward(row, row["trial"] - width),
+            "discounted_after": reward(row, row["trial"]),
+        }
+        for row in rows
+    ]
 
 
 class RunData(NamedTuple):

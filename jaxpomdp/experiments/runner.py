@@ -14,7 +14,15 @@ import numpy as np
 from jaxpomdp.experiments.config import EVALUATION_SEED, RunConfig, describe, did_you_mean
 from jaxpomdp.experiments.progress import Progress
 from jaxpomdp.experiments.record import RunDirectory, changed_versions, open_run
-from jaxpomdp.experiments.results import edit_row, evaluation_rows, phase_rows, score, trial_rows
+from jaxpomdp.experiments.results import (
+    edit_row,
+    evaluation_rows,
+    judged_edits,
+    load_run,
+    phase_rows,
+    score,
+    trial_rows,
+)
 from jaxpomdp.experiments.stopwatch import Stopwatch
 from jaxpomdp.experiments.track import Tracker
 
@@ -193,7 +201,8 @@ class _Session:
         summary = {"seeds": list(self.config.seeds), "trials": self.trial}
         summary |= {name: [float(x) for x in values] for name, values in score(judged).items()}
         rows = trial_rows(self.config.seeds, 0, judged)
-        self.record.finish(final, rows, summary | {"seconds": self.watch.total()})
+        edits = judged_edits(load_run(self.record.path))
+        self.record.finish(final, rows, summary | {"seconds": self.watch.total()}, edits)
 
 
 def _due(before: int, after: int, every: int) -> bool:

@@ -106,6 +106,16 @@ def test_what_is_on_disk_is_what_happened(whole):
     np.testing.assert_allclose(summary["goal_percent"], score(data.final)["goal_percent"])
 
 
+def test_edits_are_judged_by_the_trials_around_them(whole):
+    data = load_run(whole)
+    rewards = data.trials["discounted"][0].reshape(5, 5).mean(1)
+    judged = [json.loads(line) for line in (whole / "edits-judged.jsonl").read_text().splitlines()]
+    assert [edit["trial"] for edit in judged] == [5, 10, 15, 20, 25]
+    np.testing.assert_allclose([edit["discounted_before"] for edit in judged], rewards)
+    np.testing.assert_allclose([edit["discounted_after"] for edit in judged[:-1]], rewards[1:])
+    assert judged[-1]["discounted_after"] is None
+
+
 def test_nothing_to_learn_is_only_judged(tmp_path):
     config = RunConfig(agent="fake", seeds=(1, 2), trials=0, final_trials=7)
     data = load_run(run(tmp_path, config))
