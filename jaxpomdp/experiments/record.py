@@ -106,7 +106,7 @@ class RunDirectory:
         save_arrays(self.path / "checkpoint.npz", flatten(state), meta)
 
     def finish(self, state: Any, rows: Rows, summary: Mapping[str, Any], edits: Rows = ()) -> None:
-        """Write the agent as it ended, its last trials, its edits as judged, and the summary, which says so."""
+        """Write the agent as it ended, its last trials, its judged edits, and the summary, which says so."""
         if edits:
             write_atomically(self.path / "edits-judged.jsonl", lines_text(edits).encode())
         save_arrays(self.path / "model.npz", flatten(state), {})
