@@ -18,9 +18,9 @@ from jaxpomdp.experiments import arrays
 from jaxpomdp.models.coupled import COUPLED_PRODUCT
 from jaxpomdp.models.em import e_step
 from jaxpomdp.structure.evidence import return_evidence
+from tests.agents.small import SEEDS, assert_equal, rounds
 
 WORLD = tmaze(1, step_limit=6)
-SEEDS = (5, 6)
 SETTINGS = {
     "schedule": Schedule(1.0, 0.0, 60),
     "alpha": 0.1,
@@ -41,17 +41,6 @@ SETTINGS = {
 
 def small(**settings):
     return Agent(WORLD, with_settings(LEARNERS["cudhmm-tmaze"], SETTINGS | settings))
-
-
-def rounds(agent, count):
-    states = [agent.init(SEEDS)]
-    for _ in range(count):
-        states.append(agent.run(states[-1])[0])
-    return states
-
-
-def assert_equal(one, other):
-    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from jaxpomdp.agents.tree_kind import HierarchicalModel
 from jaxpomdp.envs.hallway import hallway_navigation
 from jaxpomdp.experiments import arrays
 from jaxpomdp.structure.coupled_tree import validate_coupled_tree
+from tests.agents.small import SEEDS, assert_equal, rounds
 
 WORLD = hallway_navigation(step_limit=20)
-SEEDS = (5, 6)
 SETTINGS = {
     "schedule": Schedule(1.0, 0.2, 9000),
     "states": 9,
@@ -43,17 +43,6 @@ SETTINGS = {
 def small(**settings):
     config = replace(HALLWAY, model=CoupledTreeModel(HierarchicalModel(levels=2, form="sober")))
     return Agent(WORLD, with_settings(config, SETTINGS | settings))
-
-
-def rounds(agent, count):
-    states = [agent.init(SEEDS)]
-    for _ in range(count):
-        states.append(agent.run(states[-1])[0])
-    return states
-
-
-def assert_equal(one, other):
-    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.fixture(scope="module")

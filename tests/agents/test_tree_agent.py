@@ -14,9 +14,9 @@ from jaxpomdp.agents.tree_kind import HierarchicalModel
 from jaxpomdp.envs.tmaze import tmaze
 from jaxpomdp.experiments import arrays
 from jaxpomdp.structure.tree import validate_tree
+from tests.agents.small import SEEDS, assert_equal, rounds
 
 WORLD = tmaze(1, step_limit=6)
-SEEDS = (5, 6)
 SETTINGS = {
     "schedule": Schedule(1.0, 0.2, 600),
     "alpha": 0.1,
@@ -36,17 +36,6 @@ SETTINGS = {
 
 def small(**settings):
     return Agent(WORLD, with_settings(LEARNERS["hudhmm-tmaze"], SETTINGS | settings))
-
-
-def rounds(agent, count):
-    states = [agent.init(SEEDS)]
-    for _ in range(count):
-        states.append(agent.run(states[-1])[0])
-    return states
-
-
-def assert_equal(one, other):
-    jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +120,7 @@ def test_bad_settings_are_refused(settings, message):
         HierarchicalModel(**settings)
 
 
+@pytest.mark.slow
 def test_it_learns_the_t_maze():
     """Three of four seeds take the right arm at the end: a hidden bit is carried through a tree."""
     agent = make_agent("hudhmm-tmaze", tmaze(4))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from jaxpomdp.agents.tree_kind import HMO
 from jaxpomdp.experiments.config import RunConfig
-from jaxpomdp.experiments.experiment import Experiment, Measured, Row
+from jaxpomdp.experiments.experiment import Experiment, Row
 from jaxpomdp.experiments.thesis import fig_6_7, maze89
-from jaxpomdp.experiments.thesis.worlds import plot_held
+from jaxpomdp.experiments.thesis.worlds import picture_of
 
 
 def _without(name: str) -> tuple[str, ...]:
@@ -59,13 +58,6 @@ def flat_control(base: RunConfig, agent: str, most: int) -> RunConfig:
     return replace(base, agent=agent, settings=tuple((same | shared).items()))
 
 
-def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
-    """Draw the runs that held in either world, a group of bars for each variant."""
-    names = [*VARIANTS, FLAT]
-    variants = {name: measured[i :: len(names)] for i, name in enumerate(names)}
-    return plot_held(experiment, variants, list(WORLDS), path)
-
-
 EXPERIMENT = Experiment(
     name="ablation-operators",
     title="The Hierarchical Model Operators, one left out at a time",
@@ -77,7 +69,7 @@ EXPERIMENT = Experiment(
         "mean_goal_percent": "goal %, mean of seeds",
         "median_steps": "median steps",
     },
-    plot=plot,
+    plot=picture_of((*VARIANTS, FLAT), tuple(WORLDS)),
     notes=(
         "The thesis says that results are poor without the observation, brother or uncle split, and that the "
         "parent split helps only from a sober tree. A run holds when its last two greedy evaluations reach "

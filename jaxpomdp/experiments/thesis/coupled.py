@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from jaxpomdp.experiments.config import RunConfig
-from jaxpomdp.experiments.experiment import Experiment, Measured, Row
+from jaxpomdp.experiments.experiment import Experiment, Row
 from jaxpomdp.experiments.thesis import fig_3_7, hallway, maze89
-from jaxpomdp.experiments.thesis.worlds import plot_held
+from jaxpomdp.experiments.thesis.worlds import picture_of
 
 VARIANTS = (
     ("product", "exact"),
@@ -45,13 +43,6 @@ def _rows(world: str) -> list[Row]:
     return rows
 
 
-def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
-    """Draw the runs that held in every world, a group of bars for each variant."""
-    names = ["flat", *(", ".join(variant) for variant in VARIANTS)]
-    variants = {name: measured[i :: len(names)] for i, name in enumerate(names)}
-    return plot_held(experiment, variants, list(WORLDS), path)
-
-
 EXPERIMENT = Experiment(
     name="coupled",
     title="Coupled agents, by coupling and inference",
@@ -63,7 +54,7 @@ EXPERIMENT = Experiment(
         "goal_percent": "goal %",
         "mean_steps": "steps, mean of seeds",
     },
-    plot=plot,
+    plot=picture_of(("flat", *(", ".join(variant) for variant in VARIANTS)), tuple(WORLDS)),
     notes=(
         "With the product a split adds a return state at the statistics of the split state, as in the "
         "thesis; with the mixture, one for each component. A run holds when its last two greedy evaluations "

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from jaxpomdp.experiments.experiment import Experiment, Measured, Row
+from jaxpomdp.experiments.experiment import Experiment, Row
 from jaxpomdp.experiments.thesis import fig_3_7, fig_6_7, maze89
-from jaxpomdp.experiments.thesis.worlds import plot_held
+from jaxpomdp.experiments.thesis.worlds import picture_of
 
 WORLDS = {
     "T-maze, N = 10": (fig_6_7.run(10, "hudhmm-tmaze"), "hudhmm-coupled-tmaze", fig_3_7.CRITERION),
@@ -36,12 +35,6 @@ def _rows(world: str) -> list[Row]:
     return [Row(f"{world}, {name}", run, criterion=criterion) for name, run in runs.items()]
 
 
-def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
-    """Draw the runs that held in either world, a group of bars for each variant."""
-    variants = {name: measured[i :: len(VARIANTS)] for i, name in enumerate(VARIANTS)}
-    return plot_held(experiment, variants, list(WORLDS), path)
-
-
 EXPERIMENT = Experiment(
     name="coupled-hierarchy",
     title="A hierarchy with a flat chain coupled to it",
@@ -53,7 +46,7 @@ EXPERIMENT = Experiment(
         "mean_goal_percent": "goal %, mean of seeds",
         "median_steps": "median steps",
     },
-    plot=plot,
+    plot=picture_of(tuple(VARIANTS), tuple(WORLDS)),
     notes=(
         "The thesis saw no effect of the coupling or the cousin split. A run holds when its last two tests "
         "reach the right arm in 95 % of trials (T-maze), or the goal in 92 % (maze, after 1,000 "

@@ -1,8 +1,8 @@
-"""What the experiments that go through several worlds share: one picture."""
+"""What the experiments that go through several worlds share: rows by world and variant, and one picture."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from jaxpomdp.experiments.experiment import Experiment, Measured
@@ -17,3 +17,13 @@ def plot_held(
     top = next(iter(variants.values()))[0].per_seed["success_held"].size
     labels = {"xlabel": "world", "ylabel": "runs that held"}
     return bars(groups, worlds, path, title=experiment.title, top=top, **labels)
+
+
+def picture_of(variants: Sequence[str], worlds: Sequence[str]) -> Callable[..., Path]:
+    """Return the ``plot`` of an experiment whose rows go through all variants, world after world."""
+
+    def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
+        groups = {name: measured[i :: len(variants)] for i, name in enumerate(variants)}
+        return plot_held(experiment, groups, list(worlds), path)
+
+    return plot
