@@ -25,10 +25,10 @@ demo: $(VENV)/.ready-demo  ## watch five agents learn the 89-state maze, then se
 	@$(BIN)/jaxpomdp demo
 
 test: $(VENV)/.ready-dev  ## the usual tests
-	$(BIN)/python -m pytest -n $(WORKERS) $(TESTFLAGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(TESTFLAGS)
 
 test-slow: $(VENV)/.ready-dev  ## all tests, the long ones too
-	$(BIN)/python -m pytest -n $(WORKERS) -m "slow or not slow" $(TESTFLAGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or not slow" $(TESTFLAGS)
 
 lint: $(VENV)/.ready-dev  ## style, format, layering and types
 	$(BIN)/ruff check .
