@@ -63,6 +63,7 @@ def grown(seed: int) -> tuple[CoupledTreeSpec, np.ndarray, tuple[int, int]]:
     tree = random_tree(seed, 9, ACTIONS, SYMBOLS, levels=2, form="sober", concentration=0.3)
     top, found = int(tree.parent[0]), cousins(tree, 0)
     one, other = (int(node) for node in found.nodes[:2])
+    assert found.kin is not None
     tree = led(tree, int(found.kin[0]), top)
     leaves = branch_leaves(tree, top)
     copy = clone_branch(tree, top, np.full(tree.num_nodes + 1, 0.5))

@@ -6,6 +6,7 @@ agent also do what the flat one does (section 3.3), and a tree of one level is t
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,11 +87,7 @@ def apply(spec: TreeSpec, edit: Edit) -> TreeSpec:
 
 def _in_two(edit: Edit) -> Edit:
     halved = shrink_split(edit, 1)
-    details = LeafSplit(edit.node, halved.details)
-    return Edit(KIND, *(getattr(halved, name) for name in _TESTED), details)
-
-
-_TESTED = ("node", "num_states", "copied", "score", "statistic", "p_value", "effect", "weight")
+    return replace(halved, kind=KIND, details=LeafSplit(edit.node, halved.details))
 
 
 def _shares(spec: TreeSpec, split: StateSplit) -> np.ndarray:

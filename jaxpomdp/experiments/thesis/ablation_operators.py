@@ -44,7 +44,7 @@ FLAT = "flat, as many states"
 def _rows(world: str) -> list[Row]:
     base, agent, criterion, most = WORLDS[world]
     runs = {
-        name: replace(base, settings=tuple((dict(base.settings) | settings).items()))
+        name: replace(base, settings=tuple((dict(base.settings) | dict(settings)).items()))
         for name, settings in VARIANTS.items()
     }
     runs[FLAT] = flat_control(base, agent, most)
