@@ -19,7 +19,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#1864ab", "#e8590c", "#2b8a3e", "#862e9c", "#c92a2a", "#0b7285", "#846358", "#5f6b76")
-BAR_COLOURS = ("#4c7fb0", "#c3d3e3", "#e3b98f", "#efe0cf", "#8fae8b", "#d5e3cf", "#b09ac0", "#e2d8ea")
+BAR_COLOURS = (
+    "#4c7fb0",
+    "#c3d3e3",
+    "#e3b98f",
+    "#efe0cf",
+    "#8fae8b",
+    "#d5e3cf",
+    "#b09ac0",
+    "#e2d8ea",
+    "#7b7f87",
+)
 INK, PALE, GRID = "#212529", "#868e96", "#e9ecef"
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -182,7 +192,9 @@ def _draw_line(ax: Axes, line: Line) -> None:
 def _legend_below(figure: Figure, ax: Axes) -> None:
     handles, labels = ax.get_legend_handles_labels()
     if labels:
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4), frameon=False)
+        room = int(figure.get_figwidth() / (0.6 + 0.085 * max(map(len, labels))))
+        columns = max(min(len(labels), 4, room), 1)
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def comparison(
