@@ -14,12 +14,17 @@ from typing import Any
 import jax
 
 from jaxpomdp import packing
-from jaxpomdp._types import Array, TrialBatch
-from jaxpomdp.agents import learner
+from jaxpomdp._types import TrialBatch
 from jaxpomdp.agents.kinds import Kind, Room, Sizes
 from jaxpomdp.agents.learner import LearnerConfig
-from jaxpomdp.agents.tree_evidence import evidence_of_model, gather_tree_evidence
-from jaxpomdp.agents.tree_kind import HierarchicalModel, room_of_trees, start_tree, tree_room
+from jaxpomdp.agents.tree_kind import (
+    HierarchicalModel,
+    evidence_of_tree,
+    gather_of_leaves,
+    room_of_trees,
+    start_tree,
+    tree_room,
+)
 from jaxpomdp.coupled_packing import pack_coupled_trees, unpack_coupled_trees
 from jaxpomdp.models.coupled_tree import COUPLED_TREE, LEAVES_ALONE, CoupledTreeParams
 from jaxpomdp.models.init import stack_models
@@ -27,7 +32,6 @@ from jaxpomdp.packing import TreeCapacity
 from jaxpomdp.structure.coupled_tree import coupled_tree
 from jaxpomdp.structure.coupled_tree_edits import COUSIN_SPLIT, CousinSplitConfig, lifted
 from jaxpomdp.structure.edits import Operator
-from jaxpomdp.structure.tree_evidence import TreeEvidence
 
 
 @dataclass(frozen=True)
@@ -63,8 +67,10 @@ def _kind(model: CoupledTreeModel) -> Kind:
         room_of=lambda params: room_of_trees(params.tree),
         pack=lambda specs, room: pack_coupled_trees(specs, TreeCapacity(*room)),
         unpack=unpack_coupled_trees,
-        gather=partial(_gather, model.tree.return_bins),
-        evidence=lambda arrays, s, spec: evidence_of_model(TreeEvidence(*arrays), s, spec.num_states),
+        gather=lambda params, *rest: gather_of_leaves(
+            LEAVES_ALONE, params, params.tree, model.tree.return_bins, *rest
+        ),
+        evidence=evidence_of_tree,
         operators=partial(_operators, model),
     )
 
@@ -88,11 +94,3 @@ def _start(
     tree = packing.unpack(stack_models([start_tree(model.tree, seed, sizes, settings, room, batch)]), 0)
     packed = pack_coupled_trees([coupled_tree(tree)], TreeCapacity(*room))
     return jax.tree.map(lambda x: x[0], packed)
-
-
-def _gather(
-    bins: int, params: CoupledTreeParams, batch: TrialBatch, trial: Array, settings: LearnerConfig
-) -> TreeEvidence:
-    symbols = params.tree.emissions[0].log_prob.shape[-1]
-    config = learner.em_config(settings)
-    return gather_tree_evidence(LEAVES_ALONE, params, batch, batch.observations[0], config, symbols, bins)

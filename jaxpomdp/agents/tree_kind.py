@@ -20,6 +20,7 @@ from jaxpomdp.agents import learner
 from jaxpomdp.agents.kinds import Kind, Room, Sizes, start_flat, state_room
 from jaxpomdp.agents.learner import LearnerConfig
 from jaxpomdp.agents.tree_evidence import evidence_of_model, gather_tree_evidence
+from jaxpomdp.models.family import Family
 from jaxpomdp.models.hierarchical import HIERARCHICAL, TreeParams
 from jaxpomdp.models.init import stack_models
 from jaxpomdp.numerics import bucket
@@ -101,8 +102,8 @@ def _kind(model: HierarchicalModel) -> Kind:
         room_of=room_of_trees,
         pack=lambda specs, room: packing.pack(specs, TreeCapacity(*room)),
         unpack=packing.unpack_all,
-        gather=partial(gather_of_trees, model.return_bins),
-        evidence=lambda arrays, s, spec: evidence_of_model(TreeEvidence(*arrays), s, spec.num_states),
+        gather=lambda params, *rest: gather_of_leaves(HIERARCHICAL, params, params, model.return_bins, *rest),
+        evidence=evidence_of_tree,
         operators=partial(_operators, model),
     )
 
@@ -151,10 +152,31 @@ def room_of_trees(params: TreeParams) -> TreeCapacity:
     return TreeCapacity(leaves, params.log_vertical.shape[-2], depths - 1)
 
 
-def gather_of_trees(
-    bins: int, params: TreeParams, batch: TrialBatch, trial: Array, settings: LearnerConfig
+def gather_of_leaves(
+    family: Family,
+    params: Any,
+    tree: TreeParams,
+    bins: int,
+    batch: TrialBatch,
+    trial: Array,
+    settings: LearnerConfig,
 ) -> TreeEvidence:
-    """Gather what the operators compare, on the device; the first channel is what counts as seen."""
-    symbols = params.emissions[0].log_prob.shape[-1]
+    """Gather what the operators compare, on the device; the first channel is what counts as seen.
+
+    Args:
+        family: of the models.
+        params: of the models.
+        tree: the trees in them.
+        bins: of the returns.
+        batch: tapes.
+        trial: not needed; the number of each step's trial.
+        settings: of the learner.
+    """
+    symbols = tree.emissions[0].log_prob.shape[-1]
     config = learner.em_config(settings)
-    return gather_tree_evidence(HIERARCHICAL, params, batch, batch.observations[0], config, symbols, bins)
+    return gather_tree_evidence(family, params, batch, batch.observations[0], config, symbols, bins)
+
+
+def evidence_of_tree(arrays: Any, s: int, spec: Any) -> TreeEvidence:
+    """Return what one seed's tapes say of the leaves of its tree."""
+    return evidence_of_model(TreeEvidence(*arrays), s, spec.num_states)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxpomdp.experiments.record import RunDirectoryError, read_json, read_table
+from jaxpomdp.experiments.record import RunDirectoryError, read_json, read_lines, read_table
 
 PER_PHASE = ("states", "log_evidence", "epsilon")
 PER_TRIAL = ("steps", "reward", "discounted", "success")
@@ -69,11 +68,9 @@ def judged_edits(run: RunData) -> list[dict[str, Any]]:
     ``discounted_before`` and ``discounted_after`` are means over a phase's trials of the discounted reward
     that the seed collected, exploring; None after the last phase.
     """
-    file = run.path / "edits.jsonl"
-    if not file.exists() or not run.phases:
+    if not run.phases:
         return []
     width = int(run.phases["trial"][0, 0])
-    rows = [json.loads(line) for line in file.read_text().splitlines()]
 
     def reward(edit: Mapping[str, Any], begin: int) -> float | None:
         trials = run.trials["discounted"][run.seeds.index(edit["seed"]), begin : begin + width]
@@ -85,7 +82,7 @@ def judged_edits(run: RunData) -> list[dict[str, Any]]:
             "discounted_before": reward(row, row["trial"] - width),
             "discounted_after": reward(row, row["trial"]),
         }
-        for row in rows
+        for row in read_lines(run.path / "edits.jsonl")
     ]
 
 

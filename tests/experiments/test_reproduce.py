@@ -13,7 +13,7 @@ from jaxpomdp.experiments.experiment import summarise
 from jaxpomdp.experiments.reproduce import Effort, markdown_table, reproduce
 from tests.experiments.fake import FakeAgent
 
-NAMES = ("table-3.1", "fig-3.4", "fig-3.5", "fig-3.7", "fig-3.9", "fig-3.10")
+NAMES = tuple(thesis.experiments())
 
 
 def stand_in(config):

@@ -10,7 +10,7 @@ from jaxpomdp.agents.tree_kind import HMO
 from jaxpomdp.experiments.config import RunConfig
 from jaxpomdp.experiments.experiment import Experiment, Row
 from jaxpomdp.experiments.thesis import fig_6_7, maze89
-from jaxpomdp.experiments.thesis.worlds import picture_of
+from jaxpomdp.experiments.thesis.worlds import COLUMNS, picture_of
 
 
 def _without(name: str) -> tuple[str, ...]:
@@ -63,12 +63,7 @@ EXPERIMENT = Experiment(
     title="The Hierarchical Model Operators, one left out at a time",
     source="thesis, section 6.3, in words",
     rows=tuple(row for world in WORLDS for row in _rows(world)),
-    columns={
-        "successes_held": "runs that held",
-        "successes_ever": "runs that ever succeeded",
-        "mean_goal_percent": "goal %, mean of seeds",
-        "median_steps": "median steps",
-    },
+    columns=COLUMNS,
     plot=picture_of((*VARIANTS, FLAT), tuple(WORLDS)),
     notes=(
         "The thesis says that results are poor without the observation, brother or uncle split, and that the "

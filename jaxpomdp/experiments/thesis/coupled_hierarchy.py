@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxpomdp.experiments.experiment import Experiment, Row
 from jaxpomdp.experiments.thesis import fig_3_7, fig_6_7, maze89
-from jaxpomdp.experiments.thesis.worlds import picture_of
+from jaxpomdp.experiments.thesis.worlds import COLUMNS, picture_of
 
 WORLDS = {
     "T-maze, N = 10": (fig_6_7.run(10, "hudhmm-tmaze"), "hudhmm-coupled-tmaze", fig_3_7.CRITERION),
@@ -40,12 +40,7 @@ EXPERIMENT = Experiment(
     title="A hierarchy with a flat chain coupled to it",
     source="thesis, section 6.3.5, in words",
     rows=tuple(row for world in WORLDS for row in _rows(world)),
-    columns={
-        "successes_held": "runs that held",
-        "successes_ever": "runs that ever succeeded",
-        "mean_goal_percent": "goal %, mean of seeds",
-        "median_steps": "median steps",
-    },
+    columns=COLUMNS,
     plot=picture_of(tuple(VARIANTS), tuple(WORLDS)),
     notes=(
         "The thesis saw no effect of the coupling or the cousin split. A run holds when its last two tests "

@@ -10,8 +10,8 @@ from typing import Any
 from jaxpomdp.agents.tree_kind import HMO
 from jaxpomdp.experiments.config import RunConfig
 from jaxpomdp.experiments.experiment import Experiment, Measured, Row
-from jaxpomdp.experiments.plots import Bars, bars
 from jaxpomdp.experiments.thesis import fig_3_7
+from jaxpomdp.experiments.thesis.worlds import plot_held
 
 LENGTHS = (4, 10, 20, 30, 50)
 BEST, THESIS, FLAT = "HMO-HUDHMM at its best", "HMO-HUDHMM", "UDHMM"
@@ -42,13 +42,10 @@ def _runs(length: int) -> dict[str, RunConfig]:
 
 def plot(experiment: Experiment, measured: Sequence[Measured], path: Path) -> Path:
     """Draw the runs that held, the hierarchical agents beside the flat one, with Wilson intervals."""
-    groups = [
-        Bars(name, [m.metrics["successes_held"] for m in measured if m.row.name.startswith(f"{name}, N")])
-        for name in (BEST, THESIS, FLAT)
-    ]
-    labels = {"xlabel": "length of the corridor, N", "ylabel": "runs that held"}
-    top = measured[0].per_seed["success_held"].size
-    return bars(groups, [str(n) for n in LENGTHS], path, title=experiment.title, top=top, **labels)
+    count = len(LENGTHS)
+    variants = {name: measured[i * count :][:count] for i, name in enumerate((BEST, THESIS, FLAT))}
+    places = [str(n) for n in LENGTHS]
+    return plot_held(experiment, variants, places, path, xlabel="length of the corridor, N")
 
 
 EXPERIMENT = Experiment(
