@@ -178,7 +178,11 @@ def _check(
 
 
 def _floor(values: np.ndarray, share: np.ndarray, floor: float) -> float:
-    """Keep every component wider than rounding, so that no density is infinite."""
+    """Keep every component wider than rounding, so that no density is infinite.
+
+    Where nothing has weight, all values count alike.
+    """
+    share = share if share.any() else np.full(len(share), 1 / len(share))
     mean = float(values @ share)
     spread = float((values - mean) ** 2 @ share)
     return max(floor, 1e-9 * spread, 1e-12 * mean**2, float(np.finfo(float).tiny))

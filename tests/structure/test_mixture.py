@@ -97,6 +97,11 @@ def test_any_data_give_a_mixture(rows: list[tuple[float, float]], components: in
     assert np.isfinite(fit.log_likelihood)
 
 
+def test_values_without_any_weight_overflow_nothing() -> None:
+    fit = fit_mixture(np.array([0.0, 3.0]), np.zeros(2), 1)
+    assert np.isfinite([fit.mean[0], fit.var[0], fit.log_likelihood]).all()
+
+
 def test_a_value_of_next_to_no_weight_is_absent() -> None:
     fit = fit_mixture(np.array([0.0, 3.0]), np.array([1.0, 5e-324]), 1)
     alone = fit_mixture(np.array([0.0]), np.array([1.0]), 1)
