@@ -50,8 +50,9 @@ def propagate_marginals(belief: Rows, trans: Rows, action: Array) -> Rows:
         action: int scalar.
     """
     joint = outer(belief).reshape(-1)
-    tables = (table[action].reshape(joint.shape[0], -1) for table in trans)
-    return tuple(jnp.matmul(joint, table, precision=EXACT) for table in tables)
+    tables = (jnp.moveaxis(table, 0, -2).reshape(joint.shape[0], -1) for table in trans)
+    pushed = (jnp.matmul(joint, table, precision=EXACT) for table in tables)
+    return tuple(x.reshape(table.shape[0], -1)[action] for x, table in zip(pushed, trans, strict=True))
 
 
 def observe_marginals(predicted: Rows, log_obs: Rows) -> tuple[Rows, Array]:
@@ -94,9 +95,9 @@ def _scaled(x: Array) -> Array:
 
 def _promises(trans: Rows, action: Array, future: Rows) -> Rows:
     """Return what each chain's next state promises, from every joint state: ``[N_1, ..., N_C]`` per chain."""
-    tables = (table[action] for table in trans)
     return tuple(
-        jnp.tensordot(t, row, axes=1, precision=EXACT) for t, row in zip(tables, future, strict=True)
+        jnp.tensordot(table, row, axes=1, precision=EXACT)[action]
+        for table, row in zip(trans, future, strict=True)
     )
 
 
@@ -145,13 +146,42 @@ def _backward(trans: Rows, weight: Rows, belief: Rows, actions: Array, linked: A
 
 def _move_counts(table: Array, leaving: Array, arriving: Array, actions: Array) -> Array:
     """Return ``P(x, x') sum_t [a_t = a] leaving_t(x) arriving_t(x')``: one matrix product per action."""
-    left = leaving.reshape(leaving.shape[0], -1)
+    steps = actions.size
+    left, right = leaving.reshape(steps, -1), arriving.reshape(steps, -1)
 
     def count(action: Array) -> Array:
-        chosen = jnp.where((actions == action)[:, None], left, 0)
-        return jnp.matmul(chosen.T, arriving, precision=EXACT)
+        chosen = jnp.where((actions.reshape(steps, 1) == action), left, 0)
+        return jnp.matmul(chosen.T, right, precision=EXACT)
 
     return table * lax.map(count, jnp.arange(table.shape[0])).reshape(table.shape)
+
+
+def _sweep(
+    chain: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array
+) -> tuple[Array, _Swept]:
+    """Sweep one tape: its log-evidence, and what each step adds to the counts; gamma is zero at padding."""
+    filtered = filter_marginals(chain, log_obs, actions, start, valid)
+    weight = tuple(relative_likelihood(row, valid) for row in log_obs)
+    trans = tuple(map(jnp.exp, chain.log_trans))
+    swept = _backward(trans, weight, filtered.belief, actions, linked_steps(start, valid))
+    gamma = tuple(where_valid(valid, x) for x in swept.gamma)
+    return jnp.sum(filtered.log_norm), swept._replace(gamma=gamma)
+
+
+def smooth_marginals_of_tapes(
+    chain: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array
+) -> CoupledPosterior:
+    """Smooth ``B`` tapes of one model, as ``smooth_marginals`` does one; ``xi`` and ``initial`` are summed.
+
+    The counts of all tapes come from one matrix product: a table of counts per tape would cost more than
+    the sweeps.
+    """
+    log_evidence, swept = jax.vmap(_sweep, in_axes=(None, 0, 0, 0, 0))(chain, log_obs, actions, start, valid)
+    sides = zip(chain.log_trans, swept.leaving, swept.arriving, strict=True)
+    xi = tuple(_move_counts(jnp.exp(table), left, right, actions) for table, left, right in sides)
+    first = jax.vmap(trial_starts)(start, valid)
+    initial = tuple(jnp.sum(jnp.where(first[..., None], x, 0), axis=(0, 1)) for x in swept.gamma)
+    return CoupledPosterior(log_evidence, swept.gamma, xi, initial)
 
 
 def smooth_marginals(
@@ -168,13 +198,6 @@ def smooth_marginals(
         start: bool ``[T]``, first step of a trial.
         valid: bool ``[T]``, False at padding.
     """
-    trans = tuple(map(jnp.exp, chain.log_trans))
-    filtered = filter_marginals(chain, log_obs, actions, start, valid)
-    weight = tuple(relative_likelihood(row, valid) for row in log_obs)
-    swept = _backward(trans, weight, filtered.belief, actions, linked_steps(start, valid))
-    gamma = tuple(where_valid(valid, x) for x in swept.gamma)
-    sides = zip(trans, swept.leaving, swept.arriving, strict=True)
-    xi = tuple(_move_counts(table, left, right, actions) for table, left, right in sides)
-    first = trial_starts(start, valid)
-    initial = tuple(jnp.sum(where_valid(first, x), axis=0) for x in gamma)
-    return CoupledPosterior(jnp.sum(filtered.log_norm), gamma, xi, initial)
+    tape = jax.tree.map(lambda x: x[None], (log_obs, actions, start, valid))
+    seen = smooth_marginals_of_tapes(chain, *tape)
+    return seen._replace(log_evidence=seen.log_evidence[0], gamma=tuple(x[0] for x in seen.gamma))

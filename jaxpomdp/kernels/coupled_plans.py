@@ -19,7 +19,7 @@ from jaxpomdp._types import Array, Chain, Posterior
 from jaxpomdp.kernels import native
 from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior, check_two, joint_density
 from jaxpomdp.kernels.coupled_exact import smooth_joint
-from jaxpomdp.kernels.coupled_marginals import smooth_marginals
+from jaxpomdp.kernels.coupled_marginals import smooth_marginals_of_tapes
 from jaxpomdp.kernels.posterior import posterior
 from jaxpomdp.numerics import NEG
 
@@ -121,12 +121,12 @@ def coupled_posterior(
 def marginal_posterior(
     chains: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array, *, plan: str = "auto"
 ) -> CoupledPosterior:
-    """Smooth as ``coupled_posterior``, approximately, and for any number of chains: ``smooth_marginals``.
+    """Smooth as ``coupled_posterior`` but approximately, and any number of chains: ``smooth_marginals``.
 
     There is one plan; ``plan`` is taken for the sake of the signature.
     """
     _check_shapes(chains, log_obs, actions, start, valid)
-    return _mapped(smooth_marginals, chains, log_obs, actions, start, valid)
+    return jax.vmap(smooth_marginals_of_tapes)(chains, log_obs, actions, start, valid)
 
 
 def _check_shapes(chains: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array) -> None:
