@@ -101,7 +101,7 @@ class Agent:
             store,
             np.zeros(params.alive.shape, np.int64),
             np.full((len(seeds), kept), np.nan),
-            keeping.none_yet(params, q),
+            keeping.none_yet(params, q, self.config.learner.probation if self.config.learner else 0),
         )
 
     def _start(self, seeds: np.ndarray, least: Room | None = None) -> tuple[Any, Array]:
@@ -146,11 +146,13 @@ class Agent:
 
     def _judge(self, state: AgentState, discounted: np.ndarray) -> AgentState:
         """Note how the latest trials went, and keep a copy of the policy that did best on average."""
-        if not (self.config.learner and self.config.learner.keep_best):
+        settings = self.config.learner
+        if not (settings and settings.keep_best):
             return state
         width, trials = state.recent.shape[1], discounted.shape[1]
         recent = np.concatenate([state.recent, discounted], axis=1)[:, -width:]
-        best = keeping.judged(state.best, recent, state.params, state.actor.q, trials)
+        now = (state.params, state.actor.q)
+        best = keeping.judged(state.best, recent, *now, trials, settings.probation)
         return state._replace(recent=recent, best=best)
 
     def _learn(self, state: AgentState, clock: Clock) -> tuple[AgentState, np.ndarray]:
@@ -258,12 +260,18 @@ class Agent:
         rest = np.zeros((len(rests), room[0]), np.int64)
         for row, kept in zip(rest, rests, strict=True):
             row[: len(kept)] = kept
-        best = state.best
-        if room != self.kind.room_of(best.params):
-            old = self.kind.unpack(best.params)
-            kept_q = packing.carry(best.q, [np.arange(spec.num_states) for spec in old], room[0])
-            best = best._replace(params=self.kind.pack(old, room), q=kept_q)
+        kept = self._with_room(state.best.params, state.best.q, room)
+        waiting = state.best.waiting and self._with_room(*state.best.waiting, room)
+        best = state.best._replace(params=kept[0], q=kept[1], waiting=waiting)
         return state._replace(params=params, actor=replace(state.actor, q=q), rest=rest, best=best), grew
+
+    def _with_room(self, params: Any, q: Array, room: Room) -> tuple[Any, Array]:
+        """Return models and values with room for more states."""
+        if room == self.kind.room_of(params):
+            return params, q
+        specs = self.kind.unpack(params)
+        same = [np.arange(spec.num_states) for spec in specs]
+        return self.kind.pack(specs, room), packing.carry(q, same, room[0])
 
     def _replay(self, state: AgentState, batch: Any, clock: Clock) -> AgentState:
         settings, control = self.config.learner, self.config.control
@@ -293,13 +301,13 @@ class Agent:
         return summarise(experience.split_log(log, int(count)), self.world)
 
     def finish(self, state: AgentState) -> AgentState:
-        """Return the agent as it ends: where an earlier policy was clearly better on average, that one."""
+        """Return the agent as it ends: where an earlier policy is to be preferred, that one."""
         settings = self.config.learner
         if not (settings and settings.keep_best):
             return state
-        worse = keeping.clearly_worse(state.best, state.recent, settings.revert_margin)
+        back = keeping.given_up(state.best, state.recent, settings.revert_margin)
         kept = (state.best.params, state.best.q)
-        params, q = keeping.select(worse, kept, (state.params, state.actor.q))
+        params, q = keeping.select(back, kept, (state.params, state.actor.q))
         return state._replace(params=params, actor=replace(state.actor, q=q))
 
 

@@ -4,6 +4,9 @@ Policies are judged by the discounted reward of the trials that they were used i
 the average over a window of the latest trials or over its latest part, whichever is less. A long average
 alone would still praise a policy that was spoilt a few trials ago. Two averages differ clearly when they are
 further apart than some standard errors.
+
+Most of those trials were its predecessors': where luck decides, one that was spoilt just now may still seem
+the best ever. With a probation a policy waits until its successors have made some of the trials as well.
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ class Best(NamedTuple):
     """The best policy so far, for ``S`` seeds: its models and values, and how well it did.
 
     ``score[S]`` is its average discounted reward (-inf: none yet), ``error[S]`` the standard error, and
-    ``age[S]`` the number of trials since then.
+    ``age[S]`` the number of trials since then. ``waiting`` are the models and values on probation, for
+    ``served[S]`` trials so far (None: there is no probation).
     """
 
     params: Any
@@ -35,12 +39,15 @@ class Best(NamedTuple):
     score: np.ndarray
     error: np.ndarray
     age: np.ndarray
+    waiting: tuple[Any, Array] | None
+    served: np.ndarray
 
 
-def none_yet(params: Any, q: Array) -> Best:
+def none_yet(params: Any, q: Array, probation: int = 0) -> Best:
     """Return what is kept before the first trial."""
-    seeds = len(q)
-    return Best(params, q, np.full(seeds, -np.inf), np.zeros(seeds), np.zeros(seeds, np.int64))
+    none = np.zeros(len(q), np.int64)
+    waiting = (params, q) if probation else None
+    return Best(params, q, np.full(len(q), -np.inf), np.zeros(len(q)), none, waiting, none)
 
 
 def select(mask: Array, yes: Any, no: Any) -> Any:
@@ -63,13 +70,26 @@ def standing(recent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.minimum(recent.mean(axis=1), latest.mean(axis=1)), recent.std(axis=1) / np.sqrt(width)
 
 
-def judged(best: Best, recent: np.ndarray, params: Any, q: Array, trials: int) -> Best:
-    """Keep the policy of now where it stands better after the ``recent[S, K]`` trials than any did so far."""
+def judged(best: Best, recent: np.ndarray, params: Any, q: Array, trials: int, probation: int = 0) -> Best:
+    """Keep the policy of now where it stands better after the ``recent[S, K]`` trials than any did so far.
+
+    With a probation it is the waiting one that is judged, as soon as it was so many trials ago that it was
+    the one of now, and the one of now waits next.
+    """
     average, error = standing(recent)
-    better = np.where(np.isnan(average), -np.inf, average) > best.score
-    kept, values = select(better, (params, q), (best.params, best.q))
+    served = best.served + trials
+    ripe = served >= probation
+    better = ripe & (np.where(np.isnan(average), -np.inf, average) > best.score)
+    kept, values = select(better, best.waiting or (params, q), (best.params, best.q))
     score, error = (np.where(better, x, y) for x, y in ((average, best.score), (error, best.error)))
-    return Best(kept, values, score, error, np.where(better, 0, best.age + trials))
+    age = np.where(better, 0, best.age + trials)
+    waiting = best.waiting and select(ripe, (params, q), best.waiting)
+    return Best(kept, values, score, error, age, waiting, np.where(ripe, 0, served))
+
+
+def given_up(best: Best, recent: np.ndarray, margin: float) -> np.ndarray:
+    """Say which agents end with the best policy, not with the one of now, which never served a probation."""
+    return np.isfinite(best.score) if best.waiting else clearly_worse(best, recent, margin)
 
 
 def clearly_worse(best: Best, recent: np.ndarray, margin: float) -> np.ndarray:

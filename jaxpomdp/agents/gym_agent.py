@@ -101,7 +101,7 @@ class _Learner(Agent):
         sizes = Sizes(self._interface.num_actions, self._interface.num_observations)
         params = started(self.kind, seeds, sizes, settings, batch=jax.device_get(batch))
         q = jnp.full_like(state.actor.q, control_settings.optimism)
-        best = none_yet(params, q)
+        best = none_yet(params, q, settings.probation)
         return state._replace(params=params, actor=replace(state.actor, q=q), best=best)
 
 

@@ -68,6 +68,9 @@ class LearnerConfig:
     """Return at the end to the policy that was best on average over so many trials (0: keep the last)."""
     revert_margin: float = 1.0
     """... if that average was better than the last one by more than so many standard errors."""
+    probation: int = 0
+    """... or always, and a policy counts as the best only when so many trials were made after it: against
+    luck where trials succeed or fail (0: it counts at once; at most ``keep_best``)."""
     patience: int = 0
     """After so many trials without a better average, those held back by the gate not counted, go back to the
     best policy, or, where it is no better than the one of now, begin again with a new model (0: never)."""
@@ -95,6 +98,10 @@ class LearnerConfig:
                 raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
         if self.initial not in ("observation", "random"):
             raise ValueError(f"initial must be 'observation' or 'random', got {self.initial!r}")
+        if not 0 <= self.probation <= self.keep_best:
+            raise ValueError(
+                f"probation must be from 0 to keep_best = {self.keep_best}, got {self.probation}"
+            )
         if not self.theta >= 0:
             raise ValueError(f"theta must be at least 0, got {self.theta}")
 

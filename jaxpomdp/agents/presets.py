@@ -121,7 +121,7 @@ HUDHMM = AgentConfig(
 
 HUDHMM_TMAZE = AgentConfig(
     TMAZE.control,
-    replace(TMAZE.learner, policy=PolicyConfig(node_cap=20, edits_per_phase=1, order="rotate")),
+    replace(TMAZE.learner, probation=15, policy=PolicyConfig(node_cap=20, edits_per_phase=1, order="rotate")),
     HierarchicalModel(
         levels=1,
         vertical_by_action=True,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxpomdp.agents import best as keeping
 from jaxpomdp.agents.agent import Agent
@@ -46,6 +47,55 @@ def test_a_policy_that_was_just_spoilt_is_not_kept():
     np.testing.assert_array_equal(best.q, q_of(3))
     np.testing.assert_allclose(best.score, 0.9)
     assert best.age == [0]
+
+
+def chances(wins):
+    """Return a window of good trials, the latest of them as given."""
+    return np.r_[np.ones(K - len(wins)), wins][None]
+
+
+def test_luck_that_ends_with_its_probation_makes_no_best_policy():
+    """A policy that was spoilt just now profits from its predecessors' trials and its own lucky ones."""
+    at_once = keeping.none_yet(params_of(0), q_of(0))
+    waits = keeping.none_yet(params_of(0), q_of(0), probation=4)
+    late = np.r_[0.0, np.ones(K - 1)][None]
+    told = [
+        (1, late),
+        (1, late),
+        (1, late),
+        (2, chances([1, 1])),
+        (2, chances([1, 0])),
+        (2, chances([1, 0, 0, 1])),
+    ]
+    for number, recent in told:
+        now = (params_of(number), q_of(number), 2)
+        at_once, waits = keeping.judged(at_once, recent, *now), keeping.judged(waits, recent, *now, 4)
+    np.testing.assert_array_equal(at_once.q, q_of(2))
+    np.testing.assert_array_equal(waits.q, q_of(1))
+    np.testing.assert_array_equal(waits.params["table"], params_of(1)["table"])
+    assert at_once.score == [1.0]
+    assert waits.score == [1.0]
+
+
+def test_an_agent_with_a_probation_ends_with_a_policy_that_served_it():
+    waits = keeping.none_yet(params_of(0), q_of(0), probation=4)
+    good = chances([])
+    assert not keeping.given_up(waits, good, 1.0)[0]
+    for _ in range(2):
+        waits = keeping.judged(waits, good, params_of(1), q_of(1), 2, 4)
+    np.testing.assert_array_equal(waits.q, q_of(0))
+    for _ in range(2):
+        waits = keeping.judged(waits._replace(score=np.array([0.5])), good, params_of(2), q_of(2), 2, 4)
+    np.testing.assert_array_equal(waits.q, q_of(1))
+    assert keeping.given_up(waits, good, 1.0)[0]
+    assert not keeping.given_up(
+        keeping.none_yet(params_of(0), q_of(0))._replace(score=waits.score), good, 1.0
+    )[0]
+
+
+def test_a_probation_longer_than_the_average_is_refused():
+    with pytest.raises(ValueError, match="probation must be from 0 to keep_best = 60, got 61"):
+        with_settings(TMAZE, {"probation": 61})
 
 
 def test_where_nothing_is_left_to_chance_a_hair_is_no_difference():
