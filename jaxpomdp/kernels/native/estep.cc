@@ -3,7 +3,8 @@
 // Rows of one model run in step: at each time the rows that took the same action share one small matrix
 // product, and the expected transitions are one product per action over blocks of steps. Probabilities are
 // renormalised at every step; a row where underflow mattered is done again in logarithms and double precision.
-// The semantics are those of kernels/smoothing.py, kernels/filtering.py and agents/trial.py, the tests' oracles.
+// The semantics are those of kernels/smoothing.py, kernels/filtering.py, and agents/trial.py,
+// the tests' oracles.
 
 #include <algorithm>
 #include <cstdint>
@@ -42,18 +43,24 @@ ffi::Error done(bool fine) { return fine ? ffi::Error::Success() : ffi::Error::I
 // Threads that pay: each takes some 20 microseconds to start, in which one does about 3e5 multiplications.
 Index useful_threads(double multiplications) { return std::clamp<Index>(multiplications / 3e5, 1, thread_count()); }
 
+// The last three arguments of a call on tapes: actions, start, valid.
+void read_batch(const Call& call, size_t first, Batch& batch) {
+  const auto shape = call.in(first).dimensions();
+  batch.B = shape[shape.size() - 2], batch.T = shape[shape.size() - 1];
+  batch.actions = call.ints(first), batch.start = call.flags(first + 1), batch.valid = call.flags(first + 2);
+}
+
 // init, trans, log_obs, actions, start, valid; leading axes beyond these, as vmap makes them, are more models.
 Problem problem_of(const Call& call, bool counted) {
   const auto shape = call.in(2).dimensions(), square = call.in(1).dimensions();
-  const size_t rank = shape.size();
   Problem p{};
-  p.B = shape[rank - 3], p.T = shape[rank - 2], p.N = shape[rank - 1];
+  read_batch(call, 3, p);
+  p.N = shape[shape.size() - 1];
   p.A = square[square.size() - 3];
   p.S = p.N == 0 ? 0 : call.in(0).element_count() / p.N;
   p.init = call.floats(0), p.trans = call.floats(1), p.log_obs = call.floats(2);
-  p.actions = call.ints(3), p.start = call.flags(4), p.valid = call.flags(5);
   p.counted = counted;
-  p.plan_chunks();
+  p.plan_chunks(kChunkRows, p.A * p.N * p.N);
   return p;
 }
 
@@ -70,39 +77,47 @@ ffi::Error filter_tapes(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::D
   }));
 }
 
-// Adds the parts of each model's counts, in their order.
-void merge(const std::vector<float>& parts, Index models, Index chunks, Index size, float* out) {
-  const float* part = parts.data();
-  for (Index s = 0; s < models; ++s, out += size) {
-    std::fill_n(out, size, 0.0f);
-    for (Index chunk = 0; chunk < chunks; ++chunk, part += size)
-      for (Index i = 0; i < size; ++i) out[i] += part[i];
+// Where units write what is summed over the rows of a model: into the result, or, where a model has several
+// chunks, each apart, to be added in their order.
+class Sums {
+ public:
+  Sums(const Batch& batch, float* result, Index size) : batch_(batch), result_(result), size_(size) {
+    if (batch.chunks > 1) parts_.resize(batch.S * batch.chunks * size);
   }
-}
+  float* of(Index unit) { return (batch_.chunks > 1 ? parts_.data() : result_) + unit * size_; }
+  void merge() {
+    if (batch_.chunks == 1) return;
+    const float* part = parts_.data();
+    for (float* out = result_; out < result_ + batch_.S * size_; out += size_) {
+      std::fill_n(out, size_, 0.0f);
+      for (Index chunk = 0; chunk < batch_.chunks; ++chunk, part += size_)
+        for (Index i = 0; i < size_; ++i) out[i] += part[i];
+    }
+  }
+
+ private:
+  const Batch& batch_;
+  float* result_;
+  Index size_;
+  std::vector<float> parts_;
+};
 
 // Results: evidence, gamma, xi, initial.
-ffi::Error estep(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary) {
+ffi::Error estep(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary) try {
   const Call call{args, rets};
   Problem p = problem_of(call, true);
   p.evidence = call.result(0), p.belief = call.result(1);
   prefer_large_pages(p.belief, call.out(1).element_count());
-  const Index cube = p.A * p.N * p.N, units = p.S * p.chunks;
-  std::vector<float> xis, initials;
-  float *xi = call.result(2), *initial = call.result(3), *xi_to = xi, *initial_to = initial;
-  try {
-    if (p.chunks > 1) xis.resize(units * cube), initials.resize(units * p.N);
-  } catch (const std::bad_alloc&) {
-    return done(false);
-  }
-  if (p.chunks > 1) xi_to = xis.data(), initial_to = initials.data();
-  const bool fine = parallel(units, useful_threads(multiplications(p)), [&] {
-    return [=, worker = std::make_shared<Worker>(p)](Index unit) {
-      worker->smooth(unit, xi_to + unit * cube, initial_to + unit * p.N);
+  Sums xi(p, call.result(2), p.A * p.N * p.N), initial(p, call.result(3), p.N);
+  const bool fine = parallel(p.S * p.chunks, useful_threads(multiplications(p)), [&] {
+    return [&, worker = std::make_shared<Worker>(p)](Index unit) {
+      worker->smooth(unit, xi.of(unit), initial.of(unit));
     };
   });
-  if (p.chunks > 1) merge(xis, p.S, p.chunks, cube, xi);
-  if (p.chunks > 1) merge(initials, p.S, p.chunks, p.N, initial);
+  xi.merge(), initial.merge();
   return done(fine);
+} catch (const std::bad_alloc&) {
+  return done(false);
 }
 
 // q, beliefs, actions, rewards, start, valid, terminated, settings; result: the new q.

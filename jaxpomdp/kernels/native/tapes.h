@@ -14,24 +14,42 @@
 namespace {
 
 constexpr Index kChunkRows = 32;
+constexpr int32_t kStart = -1, kPadding = -2;
 
-// The batch: models s < S, rows b < B, steps t < T, states n < N, actions a < A.
-struct Problem {
-  Index S, B, T, N, A;
-  const float *init, *trans, *log_obs;
+// Tapes of many models: models s < S, rows b < B, steps t < T, actions a < A.
+struct Batch {
+  Index S, B, T, A;
   const int32_t* actions;
   const bool *start, *valid;
+  Index chunks, chunk_rows;
+
+  // Rows of a model are cut into chunks, the same for any number of threads; their counts, so many numbers for
+  // each model, may fill 64 MiB.
+  void plan_chunks(Index rows, Index counts) {
+    const Index affordable = (Index{16} << 20) / std::max<Index>(1, counts * S);
+    chunks = std::clamp<Index>((B + rows - 1) / rows, 1, std::max<Index>(16, affordable));
+    chunk_rows = (B + chunks - 1) / chunks;
+  }
+  Index model(Index unit) const { return unit / chunks; }
+  Index first_row(Index unit) const { return B * (unit % chunks) / chunks; }
+  Index rows(Index unit) const { return B * (unit % chunks + 1) / chunks - first_row(unit); }
+
+  // How a step is reached: by an action, as a trial's start, or not at all.
+  int32_t arrival(Index row, Index t) const {
+    const Index at = row * T + t;
+    if (!valid[at]) return kPadding;
+    if (t == 0 || start[at] || !valid[at - 1]) return kStart;
+    return std::clamp<int32_t>(actions[at - 1], 0, A - 1);  // as a clamped gather
+  }
+};
+
+// A batch of flat chains: states n < N.
+struct Problem : Batch {
+  Index N;
+  const float *init, *trans, *log_obs;
   float *belief, *log_norm;  // filter: probabilities and log-normalisers, [S, B, T, N] and [S, B, T]
   float* evidence;           // smoothing, where belief becomes gamma
   bool counted;              // smoothing: count transitions too
-  Index chunks, chunk_rows;
-
-  // Rows of a model are cut into chunks, the same for any number of threads; their counts may fill 64 MiB.
-  void plan_chunks() {
-    const Index affordable = (Index{16} << 20) / std::max<Index>(1, A * N * N * S);
-    chunks = std::clamp<Index>((B + kChunkRows - 1) / kChunkRows, 1, std::max<Index>(16, affordable));
-    chunk_rows = (B + chunks - 1) / chunks;
-  }
 };
 
 // Rows that share an action now: where their vectors come from and go to.
@@ -43,7 +61,6 @@ struct Group {
 };
 
 constexpr Index kBlock = 64;  // steps whose transitions are counted by one product
-constexpr int32_t kStart = -1, kPadding = -2;
 
 // The rows of one time lie far apart, too many streams for the processor to foresee: fetch each a step ahead.
 inline void fetch(const float* row, Index N) {
@@ -152,13 +169,11 @@ class Worker {
 
  private:
   void enter(Index unit) {
-    model_ = unit / p_.chunks;
-    Index part = unit % p_.chunks;
-    first_row_ = p_.B * part / p_.chunks;
-    lanes_ = p_.B * (part + 1) / p_.chunks - first_row_;
+    model_ = p_.model(unit), first_row_ = p_.first_row(unit), lanes_ = p_.rows(unit);
     failed_.assign(lanes_, false);
     evidence_.assign(lanes_, 0.0);
-    for (Index lane = 0; lane < lanes_; ++lane) read_tape(lane);
+    for (Index lane = 0; lane < lanes_; ++lane)
+      for (Index t = 0; t < T_; ++t) arrival_[t * lanes_ + lane] = p_.arrival(row(lane), t);
     std::memcpy(init_ + 0, p_.init + model_ * N_, N_ * sizeof(float));
     for (Index i = 0; i < p_.A * N_; ++i) std::memcpy(trans_ + i * ld_, trans(0) + i * N_, N_ * sizeof(float));
     if (!p_.counted) return;
@@ -169,21 +184,10 @@ class Worker {
       }
   }
 
-  // How each step is reached: by an action, as a trial's start, or not at all.
-  void read_tape(Index lane) {
-    const Index from = row(lane);
-    for (Index t = 0; t < T_; ++t) {
-      int32_t& here = arrival_[t * lanes_ + lane];
-      if (!p_.valid[from + t]) here = kPadding;
-      else if (t == 0 || p_.start[from + t] || !p_.valid[from + t - 1]) here = kStart;
-      else here = std::clamp<int32_t>(p_.actions[from + t - 1], 0, p_.A - 1);  // as a clamped gather
-    }
-  }
-
-  Index row(Index lane) const { return (model_ * p_.B + first_row_ + lane) * T_; }
+  Index row(Index lane) const { return model_ * p_.B + first_row_ + lane; }
   const float* trans(Index a) const { return p_.trans + (model_ * p_.A + a) * N_ * N_; }
-  const float* log_obs(Index lane, Index t) const { return p_.log_obs + (row(lane) + t) * N_; }
-  float* belief(Index lane, Index t) const { return p_.belief + (row(lane) + t) * N_; }
+  const float* log_obs(Index lane, Index t) const { return p_.log_obs + (row(lane) * T_ + t) * N_; }
+  float* belief(Index lane, Index t) const { return p_.belief + (row(lane) * T_ + t) * N_; }
   int32_t arrival(Index lane, Index t) const { return arrival_[t * lanes_ + lane]; }
   // The action that leads on from a step, or negative at a trial's last.
   int32_t departure(Index lane, Index t) const { return t + 1 < T_ ? arrival(lane, t + 1) : kPadding; }
@@ -237,7 +241,7 @@ class Worker {
     for (Index t = 0; t < T_; ++t) {
       const Observed seen = observed_[t * lanes_ + lane];
       const float norm = seen.shift < kImpossible ? kNeg : std::log(seen.norm) + seen.shift;
-      p_.log_norm[row(lane) + t] = arrival(lane, t) == kPadding ? 0 : norm;
+      p_.log_norm[row(lane) * T_ + t] = arrival(lane, t) == kPadding ? 0 : norm;
     }
   }
 
@@ -255,7 +259,7 @@ class Worker {
         if (arrival(lane, t) != kPadding && !step_back(lane, t, initial)) failed_[lane] = true, fine = false;
     }
     for (Index a = 0; a < p_.A; ++a) count_block(a);
-    for (Index lane : lanes) p_.evidence[p_.B * model_ + first_row_ + lane] = evidence_[lane];
+    for (Index lane : lanes) p_.evidence[row(lane)] = evidence_[lane];
     return fine;
   }
 
@@ -292,9 +296,9 @@ class Worker {
   }
 
   // In exact.h.
+  struct Row;
   void exact_filter(Index lane);
   void exact_smooth(Index lane, float* xi, float* initial);
-  std::vector<double> exact_forward(Index lane, std::vector<double>& log_belief) const;
 
   const Problem& p_;
   const Index N_, T_;
