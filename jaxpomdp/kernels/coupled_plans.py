@@ -1,10 +1,10 @@
 """Evaluation plans of coupled chains: the posterior of many models on many tapes, whichever plan runs.
 
-- ``scan`` is the definition: ``smooth_joint`` under two maps; no array has the size of a pair times a pair.
-- ``pairs`` writes the pair of states down as one chain, for the C++ loop of ``posterior``, which skips pairs
-  of no weight; on CPU in float32 where it could be built. It takes the memory of a flat chain of ``N_1 N_2``
-  states.
-- ``auto`` takes ``pairs`` where it can and there are no more than ``MOST_PAIRS``, and ``scan`` elsewhere.
+- ``scan`` is the definition: ``smooth_joint`` under two maps.
+- ``native`` is the same in C++ (``native``), on CPU in float32 where it could be built.
+- ``auto`` takes ``native`` where it can, and ``scan`` elsewhere.
+
+Neither has an array of the size of a pair times a pair.
 """
 
 from __future__ import annotations
@@ -15,13 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxpomdp._types import Array, Chain, Posterior
+from jaxpomdp._types import Array
 from jaxpomdp.kernels import native
-from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior, check_two, joint_density
+from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior, check_two
 from jaxpomdp.kernels.coupled_exact import smooth_joint
 from jaxpomdp.kernels.coupled_marginals import smooth_marginals_of_tapes
-from jaxpomdp.kernels.posterior import posterior
-from jaxpomdp.numerics import NEG
 
 Rows = tuple[Array, ...]
 
@@ -38,59 +36,48 @@ def _mapped(kernel: Any, chains: CoupledChain, *tapes: Any) -> CoupledPosterior:
     return _added(jax.vmap(over_tapes)(chains, *tapes))
 
 
-MOST_PAIRS = 1024
-"""Pairs of states up to which ``auto`` writes them down as one chain."""
+def _turned(tables: Rows) -> Rows:
+    """Exchange the two chains in their tables, ``[S, A, N_1, N_2, N_c]`` each."""
+    return tuple(jnp.swapaxes(table, 2, 3) for table in tables[::-1])
 
 
-def pair_chain(chains: CoupledChain) -> Chain:
-    """Return two chains (leading ``S``) as one of ``N_1 N_2`` states, numbered ``o N_2 + r``."""
-    first, second = chains.log_trans
-    models, actions, one, two = first.shape[:4]
-    moves = jnp.maximum(first[..., :, None] + second[..., None, :], NEG)
-    init = jnp.maximum(joint_density(chains.log_init), NEG)
-    pairs = one * two
-    return Chain(init.reshape(models, pairs), moves.reshape(models, actions, pairs, pairs))
+def _native_plan(chains: CoupledChain, log_obs: Rows, actions: Array, *flags: Array) -> CoupledPosterior:
+    """Hand the batch to the C++ loop, the larger chain last, whose states fill its vectors."""
+    if chains.log_init[0].shape[-1] > chains.log_init[1].shape[-1]:
+        turned = CoupledChain(chains.log_init[::-1], _turned(chains.log_trans))
+        seen = _native_plan(turned, log_obs[::-1], actions, *flags)
+        return CoupledPosterior(seen.log_evidence, seen.gamma[::-1], _turned(seen.xi), seen.initial[::-1])
+    init, trans = (tuple(map(jnp.exp, tables)) for tables in chains)
+    return native.coupled_estep(init, trans, log_obs, actions.astype(jnp.int32), *flags)
 
 
-def _paired(chains: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array) -> Posterior:
-    rows = jnp.maximum(joint_density(log_obs), NEG)
-    rows = rows.reshape(*rows.shape[:-2], -1)
-    return posterior(pair_chain(chains), rows, actions, start, valid)
+_PLANS = {"scan": partial(_mapped, smooth_joint), "native": _native_plan}
 
-
-def _pairs_plan(chains: CoupledChain, *tapes: Any) -> CoupledPosterior:
-    """Smooth the pair as one chain, and sum each chain's share out of what comes back."""
-    one, two = (x.shape[-1] for x in chains.log_init)
-    seen = _paired(chains, *tapes)
-    gamma, initial = (x.reshape(*x.shape[:-1], one, two) for x in (seen.gamma, seen.initial))
-    xi = seen.xi.reshape(*seen.xi.shape[:2], one, two, one, two)
-    both = lambda x: (jnp.sum(x, axis=-1), jnp.sum(x, axis=-2))  # noqa: E731
-    return CoupledPosterior(seen.log_evidence, both(gamma), both(xi), both(initial))
-
-
-PLANS = {"scan": partial(_mapped, smooth_joint), "pairs": _pairs_plan}
-"""The evaluation plans of exact inference."""
+PLANS = ("auto", *_PLANS)
+"""Names of the evaluation plans of exact inference."""
 
 
 def choose_plan(plan: str, chains: CoupledChain) -> str:
-    """Resolve ``auto``.
+    """Resolve ``auto``, and check that a named plan can run here.
 
     Raises:
-        ValueError: ``plan`` is not known, or there are not two chains.
+        ValueError: ``plan`` is not known or cannot run here, or there are not two chains.
     """
-    if plan not in ("auto", *PLANS):
-        raise ValueError(f"plan must be one of {('auto', *PLANS)}, got {plan!r}")
+    if plan not in PLANS:
+        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
     check_two(chains)
-    if plan != "auto":
-        return plan
-    few = chains.log_init[0].shape[-1] * chains.log_init[1].shape[-1] <= MOST_PAIRS
-    fast = chains.log_init[0].dtype == jnp.float32 and native.available()
-    return "pairs" if few and fast else "scan"
+    dtype = chains.log_init[0].dtype
+    fits = dtype == jnp.float32 and native.available()
+    if plan == "native" and not fits:
+        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
+    if plan == "auto":
+        return "native" if fits else "scan"
+    return plan
 
 
 @partial(jax.jit, static_argnames="plan")
 def _posterior(chains: CoupledChain, *tapes: Any, plan: str) -> CoupledPosterior:
-    return PLANS[plan](chains, *tapes)
+    return _PLANS[plan](chains, *tapes)
 
 
 def coupled_posterior(
@@ -104,13 +91,14 @@ def coupled_posterior(
         actions: int ``[S, B, T]``.
         start: bool ``[S, B, T]``.
         valid: bool ``[S, B, T]``.
-        plan: ``auto`` or one of ``PLANS``; all give the same up to rounding.
+        plan: one of ``PLANS``; all give the same up to rounding.
 
     Returns:
         ``log_evidence[S, B]``, ``gamma[c][S, B, T, N_c]``; ``xi`` and ``initial``, sums over the tapes.
 
     Raises:
-        ValueError: ``plan`` is not known, there are not two chains, or the shapes do not fit.
+        ValueError: ``plan`` is not known or cannot run here, there are not two chains, or the shapes do not
+            fit.
     """
     chosen = choose_plan(plan, chains)
     _check_shapes(chains, log_obs, actions, start, valid)

@@ -19,7 +19,6 @@ from jaxpomdp.kernels.coupled import (
 )
 from jaxpomdp.kernels.coupled_exact import smooth_both, smooth_joint, smooth_joint_exact
 from jaxpomdp.kernels.coupled_paths import sample_coupled, sample_joint_posterior, viterbi_joint
-from jaxpomdp.kernels.coupled_plans import coupled_posterior
 from jaxpomdp.kernels.smoothing import smooth
 from tests.kernels.coupled_problems import CoupledProblem, random_coupled
 from tests.kernels.problems import log_of, quick_jit, random_problem, random_rows
@@ -241,11 +240,3 @@ def as_batch(problem: CoupledProblem) -> tuple:
     chains = jax.tree.map(lambda x, y: jnp.stack([x, y]), chain, CoupledChain(chain.log_init, other))
     tapes = jax.tree.map(lambda x: jnp.stack([jnp.stack([x, x[::-1]])] * 2), (log_obs, *rest))
     return (chains, *tapes)
-
-
-@pytest.mark.parametrize("options", [{}, {"zeros": 0.4}, {"starts": 0.4, "missing": 0.4, "padding": 1}])
-def test_plans_agree(options: dict) -> None:
-    arguments = as_batch(random_coupled(1, **options))
-    one, other = (coupled_posterior(*arguments, plan=plan) for plan in ("scan", "pairs"))
-    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4)

@@ -16,9 +16,20 @@ import jax
 import jax.numpy as jnp
 
 from jaxpomdp._types import Array, Posterior
+from jaxpomdp.kernels.coupled import CoupledPosterior
 from jaxpomdp.kernels.native.build import loaded
 
-__all__ = ["Acted", "ActingModel", "WorldTables", "act", "available", "estep", "filter_tapes", "sarsa_replay"]
+__all__ = [
+    "Acted",
+    "ActingModel",
+    "WorldTables",
+    "act",
+    "available",
+    "coupled_estep",
+    "estep",
+    "filter_tapes",
+    "sarsa_replay",
+]
 
 RULES = ("sarsa", "q")
 
@@ -80,6 +91,54 @@ def estep(init: Array, trans: Array, log_obs: Array, actions: Array, start: Arra
     results = _float32(actions.shape[:2], log_obs.shape, trans.shape, init.shape)
     call = jax.ffi.ffi_call("jaxpomdp_estep", results, vmap_method="broadcast_all")
     return Posterior(*call(init, trans, log_obs, actions, start, valid))
+
+
+def coupled_estep(
+    init: tuple[Array, Array],
+    trans: tuple[Array, Array],
+    log_obs: tuple[Array, Array],
+    actions: Array,
+    start: Array,
+    valid: Array,
+) -> CoupledPosterior:
+    """Smooth all rows of all models of two chains: ``coupled_exact.smooth_joint`` for each, counts summed.
+
+    Fastest where the second chain is the one of more states.
+
+    Args:
+        init: probabilities float32 ``[S, N_c]`` of each chain.
+        trans: probabilities float32 ``[S, A, N_1, N_2, N_c]``.
+        log_obs: float32 ``[S, B, T, N_c]``; a missing step is a row of zeros.
+        actions: int32 ``[S, B, T]``; the last of a trial is ignored.
+        start: bool ``[S, B, T]``, first step of a trial.
+        valid: bool ``[S, B, T]``, False at padding.
+
+    Returns:
+        ``log_evidence[S, B]``, ``gamma[c][S, B, T, N_c]``, ``xi[c]`` as ``trans[c]``, ``initial[c]`` as
+        ``init[c]``.
+
+    Raises:
+        ValueError: an argument of another shape or dtype.
+
+    Source: thesis section 6.3.5.
+    """
+    if jnp.ndim(trans[0]) != 5 or jnp.ndim(actions) != 3:
+        shapes = f"{list(jnp.shape(trans[0]))} and {list(jnp.shape(actions))}"
+        raise ValueError(
+            f"trans[0] must have shape [S, A, N_1, N_2, N_1] and actions [S, B, T], got {shapes}"
+        )
+    batch, (_, moves, *sizes) = jnp.shape(actions), jnp.shape(trans[0])[:4]
+    for c, states in enumerate(sizes):
+        _check(f"init[{c}]", init[c], (batch[0], states), jnp.float32)
+        _check(f"trans[{c}]", trans[c], (batch[0], moves, *sizes, states), jnp.float32)
+        _check(f"log_obs[{c}]", log_obs[c], (*batch, states), jnp.float32)
+    _check("actions", actions, batch, jnp.int32)
+    _check("start", start, batch, jnp.bool_)
+    _check("valid", valid, batch, jnp.bool_)
+    results = _float32(batch[:2], *(x.shape for x in (*log_obs, *trans, *init)))
+    call = jax.ffi.ffi_call("jaxpomdp_coupled", results, vmap_method="broadcast_all")
+    evidence, *rest = call(*init, *trans, *log_obs, actions, start, valid)
+    return CoupledPosterior(evidence, tuple(rest[:2]), tuple(rest[2:4]), tuple(rest[4:]))
 
 
 def filter_tapes(

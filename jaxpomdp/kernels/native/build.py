@@ -25,6 +25,7 @@ SOURCE = FOLDER / "estep.cc"
 TARGETS = {
     "jaxpomdp_estep": "JaxpomdpEstep",
     "jaxpomdp_filter": "JaxpomdpFilter",
+    "jaxpomdp_coupled": "JaxpomdpCoupled",
     "jaxpomdp_replay": "JaxpomdpReplay",
     "jaxpomdp_act": "JaxpomdpAct",
 }

@@ -3,8 +3,8 @@
 // Rows of one model run in step: at each time the rows that took the same action share one small matrix
 // product, and the expected transitions are one product per action over blocks of steps. Probabilities are
 // renormalised at every step; a row where underflow mattered is done again in logarithms and double precision.
-// The semantics are those of kernels/smoothing.py, kernels/filtering.py, and agents/trial.py,
-// the tests' oracles.
+// The semantics are those of kernels/smoothing.py, kernels/filtering.py, kernels/coupled_exact.py and
+// agents/trial.py, the tests' oracles.
 
 #include <algorithm>
 #include <cstdint>
@@ -13,6 +13,8 @@
 #include <vector>
 
 #include "act.h"
+#include "coupled.h"
+#include "coupled_exact.h"
 #include "exact.h"
 #include "replay.h"
 #include "tapes.h"
@@ -120,6 +122,37 @@ ffi::Error estep(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictiona
   return done(false);
 }
 
+// For each chain init, then trans, then log_obs; actions, start, valid. Results: evidence; for each chain gamma,
+// then xi, then initial.
+ffi::Error coupled(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary) try {
+  const Call call{args, rets};
+  CoupledProblem p{};
+  read_batch(call, 6, p);
+  const auto shape = call.in(2).dimensions();
+  p.A = shape[shape.size() - 4];
+  for (int c = 0; c < 2; ++c) {
+    p.N[c] = shape[shape.size() - 3 + c];
+    p.init[c] = call.floats(c), p.trans[c] = call.floats(2 + c), p.log_obs[c] = call.floats(4 + c);
+    p.gamma[c] = call.result(1 + c);
+  }
+  p.evidence = call.result(0);
+  p.S = call.in(0).element_count() / p.N[0];
+  const Index pairs = p.N[0] * p.N[1], cells = p.A * pairs;
+  p.plan_chunks(kChunkTapes, cells * (p.N[0] + p.N[1]));
+  Sums xi[] = {{p, call.result(3), cells * p.N[0]}, {p, call.result(4), cells * p.N[1]}};
+  Sums initial[] = {{p, call.result(5), p.N[0]}, {p, call.result(6), p.N[1]}};
+  const double work = 3.0 * p.S * p.B * p.T * (pairs + 32) * pairs;
+  const bool fine = parallel(p.S * p.chunks, useful_threads(work), [&] {
+    return [&, worker = std::make_shared<CoupledWorker>(p)](Index unit) {
+      worker->smooth(unit, {{xi[0].of(unit), xi[1].of(unit)}, {initial[0].of(unit), initial[1].of(unit)}});
+    };
+  });
+  for (int c = 0; c < 2; ++c) xi[c].merge(), initial[c].merge();
+  return done(fine);
+} catch (const std::bad_alloc&) {
+  return done(false);
+}
+
 // q, beliefs, actions, rewards, start, valid, terminated, settings; result: the new q.
 ffi::Error replay(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary choices) {
   const Call call{args, rets};
@@ -171,5 +204,6 @@ auto binding() { return ffi::Ffi::Bind().RemainingArgs().RemainingRets().Attrs()
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpFilter, filter_tapes, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpEstep, estep, binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpCoupled, coupled, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpReplay, replay, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpAct, act, binding());

@@ -1,0 +1,203 @@
+from __future__ import annotations
+
+import re
+from functools import partial
+from math import prod
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxpomdp.kernels import native
+from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior
+from jaxpomdp.kernels.coupled_plans import choose_plan, coupled_posterior
+from jaxpomdp.numerics import NEG
+from tests.kernels.coupled_problems import CoupledProblem, random_coupled, stack_coupled
+from tests.kernels.problems import quick_jit
+from tests.kernels.test_coupled import as_batch, contradicting
+from tests.kernels.test_native import Tapes, by_numpy
+
+needs_native = pytest.mark.skipif(not native.available(), reason="needs a compiler for the native kernels")
+by_scan = quick_jit(partial(coupled_posterior, plan="scan"))
+by_native = jax.jit(partial(coupled_posterior, plan="native"))
+HARD = {"starts": 0.1, "missing": 0.2, "padding": 3, "zeros": 0.4, "scale": 2.0}
+
+
+def batch(models: int, tapes: int, **options) -> list[list[CoupledProblem]]:
+    """Draw ``models`` problems and give each ``tapes`` different tapes."""
+    return [[random_coupled(100 * s + b, model=s, **options) for b in range(tapes)] for s in range(models)]
+
+
+def outer(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Add what is said of each chain, ``[..., N_c]``, to what it says of pairs, ``[..., N_1 N_2]``."""
+    both = one[..., :, None].astype(float) + two[..., None, :]
+    return np.maximum(both, NEG).reshape(*both.shape[:-2], -1)
+
+
+def by_pairs(chains: CoupledChain, log_obs: tuple, *rest: jax.Array) -> CoupledPosterior:
+    """Write the pair down as one chain, in float64 and NumPy, and sum each chain's share."""
+    init, moves, rows = (outer(*map(np.asarray, part)) for part in (*chains, log_obs))
+    one, two = (x.shape[-1] for x in log_obs)
+    square = moves.reshape(*moves.shape[:2], one * two, one * two)
+    seen = by_numpy(Tapes(np.exp(init), np.exp(square), rows, *map(np.asarray, rest)))
+    gamma, initial = (x.reshape(*x.shape[:-1], one, two) for x in (seen.gamma, seen.initial))
+    xi = seen.xi.reshape(*seen.xi.shape[:2], one, two, one, two)
+    both = [(x.sum(axis=-1), x.sum(axis=-2)) for x in (gamma, xi, initial)]
+    return CoupledPosterior(seen.log_evidence, *both)
+
+
+def assert_same(
+    got: CoupledPosterior, want: CoupledPosterior, rtol: float = 2e-5, atol: float = 2e-5
+) -> None:
+    for name, x, y in zip(got._fields, got, want, strict=True):
+        for part, other in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
+            np.testing.assert_allclose(part, other, err_msg=name, rtol=rtol, atol=atol)
+
+
+@needs_native
+@pytest.mark.parametrize("sizes", [(3, 2), (2, 17), (16, 4), (1, 5), (5, 1), (1, 1), (7, 9)], ids=str)
+def test_native_equals_numpy(sizes: tuple[int, int]) -> None:
+    """Chains of any size, several actions, structural zeros, missing steps, trials within tapes, padding."""
+    inputs = stack_coupled(batch(2, 9, sizes=sizes, actions=3, steps=14, **HARD), np.float32)
+    assert_same(by_native(*inputs), by_pairs(*inputs))
+
+
+@needs_native
+@pytest.mark.parametrize("scale", [30.0, 300.0])
+def test_native_equals_numpy_however_sharp_the_observations(scale: float) -> None:
+    inputs = stack_coupled(batch(2, 5, sizes=(4, 3), steps=14, zeros=0.5, scale=scale), np.float32)
+    got = by_native(*inputs)
+    assert_same(got, by_pairs(*inputs))
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(got))
+
+
+@needs_native
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("options", [{}, {"zeros": 0.4}, {"starts": 0.4, "missing": 0.4, "padding": 1}])
+def test_native_equals_scan_in_both_precisions(options: dict) -> None:
+    single = as_batch(random_coupled(1, **options))
+    double = jax.tree.map(lambda x: x.astype(float) if x.dtype == jnp.float32 else x, single)
+    got = by_native(*single)
+    assert_same(got, by_scan(*single))
+    assert_same(got, by_scan(*double))
+
+
+@needs_native
+def test_a_tape_that_underflows_is_repaired_and_the_others_are_untouched() -> None:
+    bad = contradicting()
+    mild = bad._replace(log_obs=(bad.log_obs[0] / 100, bad.log_obs[1]))
+    inputs = stack_coupled([[mild, bad, mild], [bad, bad, bad]], np.float32)
+    assert_same(by_native(*inputs), by_pairs(*inputs))
+
+
+@needs_native
+def test_impossible_steps_and_dead_states() -> None:
+    """Spare states that nothing leads to; steps that no state, or no state within reach, allows."""
+    problems = batch(2, 4, sizes=(5, 4), steps=12, zeros=0.3, scale=20.0)
+    rng = np.random.default_rng(0)
+    for row in problems:
+        for problem in row:
+            for c, last in enumerate((4, 3)):
+                for table in (problem.log_init[c], problem.log_trans[c]):
+                    table[..., 0] = np.logaddexp(table[..., 0], table[..., last])
+                    table[..., last] = NEG
+                problem.log_obs[c][rng.random(problem.log_obs[c].shape) < 0.2] = NEG
+            problem.log_obs[0][3] = NEG
+    inputs = stack_coupled(problems, np.float32)
+    got = by_native(*inputs)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(got))
+    assert not any(x[..., -1].any() for x in (*got.gamma, *got.xi, *got.initial))
+    assert_same(got, by_pairs(*inputs))
+
+
+@needs_native
+def test_the_oracle_notices_an_action_that_comes_a_step_late() -> None:
+    chains, rows, actions, *flags = stack_coupled(batch(1, 3), np.float32)
+    with pytest.raises(AssertionError):
+        assert_same(
+            by_native(chains, rows, jnp.roll(actions, 1, -1), *flags), by_pairs(chains, rows, actions, *flags)
+        )
+
+
+@needs_native
+def test_what_lies_in_the_padding_does_not_matter() -> None:
+    clean = stack_coupled(batch(2, 5, padding=2), np.float32)
+    chains, rows, actions, start, valid = clean
+    spoilt = tuple(jnp.where(valid[..., None], x, jnp.nan) for x in rows), jnp.where(valid, actions, 77)
+    assert_same(by_native(chains, *spoilt, start | ~valid, valid), by_native(*clean), rtol=0, atol=0)
+
+
+@needs_native
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    inputs = stack_coupled(batch(3, 11, sizes=(9, 5), steps=30), np.float32)
+    results = []
+    for threads in (1, 2, 5):
+        monkeypatch.setenv("JAXPOMDP_THREADS", str(threads))
+        results.append(by_native(*inputs))
+    assert_same(results[0], results[1], rtol=0, atol=0)
+    assert_same(results[0], results[2], rtol=0, atol=0)
+
+
+@needs_native
+def test_it_works_under_vmap() -> None:
+    chains, rows, *rest = stack_coupled(batch(2, 3), np.float32)
+    both = jax.tree.map(lambda x: jnp.stack([x, -x]), rows)
+    mapped = jax.jit(jax.vmap(lambda x: coupled_posterior(chains, x, *rest, plan="native")))(both)
+    for k in range(2):
+        one = by_native(chains, jax.tree.map(lambda x, k=k: x[k], both), *rest)
+        assert_same(jax.tree.map(lambda x, k=k: x[k], mapped), one)
+
+
+@needs_native
+@pytest.mark.parametrize("empty", [(0, 2, 5), (2, 0, 5), (2, 2, 0)], ids=str)
+def test_empty_batches_give_empty_results(empty: tuple[int, ...]) -> None:
+    even = CoupledChain(
+        (jnp.zeros((empty[0], 3)), jnp.zeros((empty[0], 2))),
+        (jnp.zeros((empty[0], 1, 3, 2, 3)), jnp.zeros((empty[0], 1, 3, 2, 2))),
+    )
+    rows = (jnp.zeros((*empty, 3)), jnp.zeros((*empty, 2)))
+    flags = jnp.ones(empty, bool)
+    got = by_native(even, rows, jnp.zeros(empty, jnp.int32), flags, flags)
+    assert got.gamma[0].shape == (*empty, 3)
+    assert not any(np.any(leaf) for leaf in jax.tree.leaves(got))
+
+
+def largest_array(function, *arguments) -> int:
+    """Return the numbers in the largest array of a compiled function."""
+    text = str(jax.jit(function).lower(*arguments).compile().as_text())
+    return max(prod(map(int, shape.split(","))) for shape in re.findall(r"\w\[(\d[\d,]*)\]", text))
+
+
+@needs_native
+def test_no_array_has_the_size_of_a_pair_times_a_pair() -> None:
+    """One model, one action, one short tape: all else is smaller than (N_1 N_2)^2."""
+    chains, *tapes = stack_coupled([[random_coupled(0, sizes=(6, 5), actions=1, steps=3)]], np.float32)
+    assert largest_array(partial(coupled_posterior, plan="native"), chains, *tapes) == 6 * 5 * 6
+    together = largest_array(lambda one, two: one[..., None] + two[..., None, :], *chains.log_trans)
+    assert together == (6 * 5) ** 2
+
+
+def test_auto_prefers_native_and_never_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    single, double = (CoupledChain((x, x), (x, x)) for x in (np.zeros((1, 40), t) for t in ("f4", "f8")))
+    monkeypatch.setattr(native, "available", lambda: True)
+    assert choose_plan("auto", single) == "native"
+    assert choose_plan("auto", double) == "scan"
+    with pytest.raises(ValueError, match="plan 'native' needs float32 on a CPU with a compiler, got float64"):
+        choose_plan("native", double)
+    monkeypatch.setattr(native, "available", lambda: False)
+    assert choose_plan("auto", single) == "scan"
+
+
+def test_bad_arguments_are_named() -> None:
+    (init, trans), rows, actions, *flags = stack_coupled(batch(2, 3), np.float32)
+    with pytest.raises(ValueError, match=r"plan must be one of .*got 'pairs'"):
+        coupled_posterior(CoupledChain(init, trans), rows, actions, *flags, plan="pairs")
+    with pytest.raises(ValueError, match=r"trans\[0\] must have shape \[S, A, N_1, N_2, N_1\]"):
+        native.coupled_estep(init, (trans[0][0], trans[1]), rows, actions, *flags)
+    with pytest.raises(
+        ValueError, match=r"trans\[1\] must be float32\[2, 2, 3, 2, 2\], got .*\[2, 2, 3, 2, 3\]"
+    ):
+        native.coupled_estep(init, (trans[0], trans[0]), rows, actions, *flags)
+    with pytest.raises(ValueError, match=r"log_obs\[1\] must be float32.*, got float16"):
+        native.coupled_estep(init, trans, (rows[0], rows[1].astype(jnp.float16)), actions, *flags)
