@@ -97,7 +97,7 @@ def cost_rows(models: int = 4, trials: int = 8, steps: int = 64) -> list[dict[st
         given = (chains(rng, models, *sizes, 1.0), *tapes(rng, models, trials, steps, sizes))
         calls = {p: partial(coupled_posterior, *given, plan=p) for p in ("scan", "native")}
         calls["marginals"] = partial(marginal_posterior, *given)
-        found.append({"states": list(sizes)} | milliseconds(calls, 3))
+        found.append({"states": list(sizes)} | milliseconds(calls, 15))
     return found
 
 
