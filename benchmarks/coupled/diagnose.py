@@ -1,13 +1,17 @@
-"""Why do coupled agents fail in the hallway? What strand 1 tells strand 0 in learning, and acting lacks.
+"""Why do coupled agents fail in the hallway? Two suspects, measured at checkpoints of every seed.
 
     python benchmarks/coupled/diagnose.py --seeds 0 1 2 3
 
-Learning sees both strands and the return, acting strand 0 alone. For every seed and checkpoint, from the
-window of trials that learning sees: the mutual information ``I(o'; r | o, a)`` that strand 1 has about where
-strand 0 goes next, and what the observations alone are worth under the coupled model and under the chain that
-acts, in nats per step; with the steps that trials take, and whether the gate holds the model (success). The
-controls: ``theta = 0``, where no return is modelled; couplings frozen at even rows, where the strands are
-apart; and the flat agent. Writes ``benchmarks/results/coupled-diagnosis.json``.
+- *Acting lacks what learning has.* Learning sees both strands and the return, acting strand 0 alone. From the
+  window of trials that learning sees: the mutual information ``I(o'; r | o, a)`` that strand 1 has about
+  where strand 0 goes next, and what the observations are worth under the coupled model and under the chain
+  that acts, in nats per step.
+- *Exploration hides circles.* The share of trials that succeed while the agent explores, and greedily; and
+  whether the gate holds the model, which then learns no more.
+
+The controls: no return modelled (``theta = 0``); couplings frozen at even rows, where the strands are apart;
+one trial in five without exploration (rehearsals); and the flat agent. Writes ``coupled-diagnosis.json`` and
+``.png`` to ``benchmarks/results``.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxpomdp._types import TrialBatch
@@ -35,6 +40,8 @@ from jaxpomdp.models.family import Family
 from jaxpomdp.models.flat import FLAT
 
 RESULT = Path("benchmarks/results/coupled-diagnosis.json")
+JUDGED = 48
+"""Greedy trials at a checkpoint."""
 EVEN = 1e6
 """Concentration of couplings that are as good as even."""
 
@@ -66,14 +73,17 @@ def variants() -> dict[str, AgentConfig]:
     """Return the agents to look at, by name."""
     product, mixture = LEARNERS["cudhmm"], LEARNERS["cudhmm-mixture"]
     even = replace(product.model, concentration=EVEN, coupling_jitter=0.0)
-    return {
+    agents = {
         "product": product,
-        "product, theta 0": replace(product, learner=replace(product.learner, theta=0.0)),
         "product, strands apart": replace(product, model=ApartModel(even)),
         "mixture": mixture,
-        "mixture, theta 0": replace(mixture, learner=replace(mixture.learner, theta=0.0)),
         "flat": HALLWAY,
     }
+    for name in ("product", "mixture"):
+        agent = agents[name]
+        agents[f"{name}, theta 0"] = replace(agent, learner=replace(agent.learner, theta=0.0))
+        agents[f"{name}, rehearsals"] = replace(agent, control=replace(agent.control, rehearse=5))
+    return agents
 
 
 def told(moves: np.ndarray) -> float:
@@ -118,8 +128,9 @@ def worth(family: Family, params: Any, batch: TrialBatch) -> np.ndarray:
 def measured(agent: Agent, state: AgentState) -> dict[str, np.ndarray]:
     """Return what is known of every seed at a checkpoint, ``[S]`` each."""
     batch, params, family = window(agent, state), state.params, agent.family
+    greedy = agent.evaluate(state, JUDGED, jax.random.key(1))["success"].mean(axis=1)
     acting = worth(acting_families(family), params, batch)
-    found = {"observations by acting": acting, "held": agent._held(state)}
+    found = {"greedy": greedy, "observations by acting": acting, "held": agent._held(state)}
     if hasattr(params, "strands"):
         seen = e_step(family, params, batch, learner.em_config(agent.config.learner))
         moves = np.asarray(seen.xi[0], float)
@@ -139,13 +150,13 @@ def acting_families(family: Family) -> Family:
 def followed(config: AgentConfig, seeds: list[int], trials: int, every: int) -> list[dict[str, Any]]:
     """Run an agent and measure it every so many trials."""
     agent = Agent(hallway_navigation(), config)
-    state, rows, steps = agent.init(seeds), [], []
+    state, rows, won = agent.init(seeds), [], []
     for done in range(config.learner.trials_per_phase, trials + 1, config.learner.trials_per_phase):
         state, phase = agent.run(state)
-        steps.append(phase["steps"])
+        won.append(phase["success"])
         if done % every == 0:
-            latest = np.concatenate(steps, axis=1)[:, -every:].mean(axis=1)
-            found = measured(agent, state) | {"steps": latest, "states": phase["states"]}
+            latest = np.concatenate(won, axis=1)[:, -every:].mean(axis=1)
+            found = measured(agent, state) | {"exploring": latest, "states": phase["states"]}
             rows.append(
                 {"trials": done} | {k: np.round(np.asarray(v, float), 4).tolist() for k, v in found.items()}
             )
@@ -157,6 +168,34 @@ def summary(rows: list[dict[str, Any]]) -> str:
     last = {name: np.median(value) for name, value in rows[-1].items() if name not in ("trials", "held")}
     text = ", ".join(f"{name} {value:.3f}" for name, value in last.items())
     return f"held {int(sum(rows[-1]['held']))} of {len(rows[-1]['held'])}, {text}"
+
+
+def draw(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
+    """Draw the last checkpoint: success while exploring and greedily, and the two suspects' nats."""
+    last = {name: rows[-1] for name, rows in found.items()}
+    places = np.arange(len(last))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 0.5 * len(last) + 1.5), sharey=True)
+    for shift, (name, color) in zip((-0.2, 0.2), {"exploring": "C0", "greedy": "C3"}.items(), strict=True):
+        shares = [100 * np.asarray(row[name]) for row in last.values()]
+        left.barh(places + shift, [x.mean() for x in shares], 0.4, color=color, alpha=0.6, label=name)
+        for place, seeds in zip(places + shift, shares, strict=True):
+            left.plot(seeds, np.full(len(seeds), place), ".", color=color, ms=4)
+    gap = [_gap(row) for row in last.values()]
+    told_rows = [np.median(row.get("told by strand 1", 0.0)) for row in last.values()]
+    right.barh(places - 0.2, told_rows, 0.4, color="C2", label="strand 1 tells of strand 0's moves")
+    right.barh(places + 0.2, gap, 0.4, color="C1", label="observations: both strands against acting chain")
+    left.set(yticks=places, yticklabels=list(last), xlabel="trials that succeed, % (a dot is a seed)")
+    right.set(xlabel="nats per step, median of seeds")
+    left.invert_yaxis()
+    for axes in (left, right):
+        axes.legend(fontsize=8, loc="lower right")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+def _gap(row: dict[str, Any]) -> float:
+    both = row.get("observations by both", row["observations by acting"])
+    return float(np.median(np.subtract(both, row["observations by acting"])))
 
 
 def main() -> None:
@@ -175,6 +214,7 @@ def main() -> None:
         print(f"{name}: {summary(found[name])}", flush=True)
     settings = {"seeds": options.seeds, "trials": options.trials}
     write_json(RESULT, {"versions": versions(), "settings": settings, "found": found})
+    draw(found, RESULT.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -31,6 +31,11 @@ GREEDY = Schedule(0.0, 0.0, 1, "constant")
 """Exploration while an agent is judged."""
 
 
+def settled(control: ControlConfig) -> ControlConfig:
+    """Return the settings of an agent that acts as it will in the end: greedily, and its values stay."""
+    return replace(control, schedule=GREEDY, exploration="epsilon", alpha=0.0)
+
+
 @dataclass(frozen=True)
 class AgentConfig:
     """All settings of an agent; ``learner`` None means that its model stays as it is given."""
@@ -120,20 +125,31 @@ class Agent:
             per seed ``states``, ``log_evidence``, ``epsilon`` and seconds spent ``acting``, ``fitting``,
             ``structure``, ``replaying`` (the same for all seeds).
         """
-        settings, clock = self.config.learner, Clock()
-        trials = settings.trials_per_phase if settings else 50
-        actor, log, count = run_trials(
-            self.family, self.config.control, self.world, state.params, state.actor, trials=trials
-        )
-        new = experience.split_log(log, int(count))
-        rows = summarise(new, self.world)
+        clock = Clock()
+        actor, parts = self._act(state)
+        rows = joined([summarise(new, self.world) for new in parts])
         clock.lap("acting")
         state = self._judge(state._replace(actor=actor), rows["discounted"])
-        evidence = np.zeros(len(new))
-        if settings:
-            state = state._replace(experience=experience.remember(state.experience, new))
+        evidence = np.zeros(len(state.recent))
+        if self.config.learner:
+            for new in parts:
+                state = state._replace(experience=experience.remember(state.experience, new))
             state, evidence = self._learn(state, clock)
         return state, rows | self._phase_rows(state, evidence, clock)
+
+    def _act(self, state: AgentState) -> tuple[Actor, list[list[experience.Trials]]]:
+        """Run the trials of a phase: those that explore, then the rehearsals if there are any."""
+        settings, control = self.config.learner, self.config.control
+        rehearsals = settings.rehearsals if settings else 0
+        trials = (settings.trials_per_phase if settings else 50) - rehearsals
+        actor, parts = state.actor, []
+        for count, how in ((trials, control), (rehearsals, settled(control))):
+            if count:
+                actor, log, columns = run_trials(
+                    self.family, how, self.world, state.params, actor, trials=count
+                )
+                parts.append(experience.split_log(log, int(columns)))
+        return actor, parts
 
     def _phase_rows(self, state: AgentState, evidence: np.ndarray, clock: Clock) -> dict[str, np.ndarray]:
         level = self.config.control.schedule.function()(state.actor.steps)
@@ -296,7 +312,7 @@ class Agent:
         keys = of_seed(jnp.asarray(state.actor.keys)[:, -1])
         zero = jnp.zeros(len(keys), jnp.int32)
         actor = Actor(keys, state.actor.q, zero, zero)
-        control = replace(self.config.control, schedule=GREEDY, exploration="epsilon", alpha=0.0)
+        control = settled(self.config.control)
         _, log, count = run_trials(self.family, control, self.world, state.params, actor, trials=trials)
         return summarise(experience.split_log(log, int(count)), self.world)
 
@@ -322,6 +338,12 @@ def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.nda
     """Return what trials came to: ``steps``, ``reward``, ``discounted``, ``success``, ``[S, trials]``."""
     rows = [_summary(seed, world) for seed in trials]
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+
+
+def joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Lay the rows ``[S, trials]`` of :func:`summarise` side by side."""
+    names = ("steps", "reward", "discounted", "success")
+    return {name: np.concatenate([rows[name] for rows in parts], axis=1) for name in names}
 
 
 def _summary(trials: experience.Trials, world: World) -> dict[str, np.ndarray]:

@@ -87,9 +87,6 @@ class ControlConfig:
     """Chance that an exploratory action repeats the last one: crosses long corridors."""
     optimism: float = 0.0
     """Where values start."""
-    rehearse: int = 0
-    """One trial in so many is without exploration (0: none): a policy that goes round in circles unless
-    exploration frees it is found out there, and learns. With ``epsilon`` only."""
 
     def __post_init__(self) -> None:
         """Refuse numbers and names that mean nothing."""
@@ -100,11 +97,6 @@ class ControlConfig:
             raise ValueError(f"rule must be 'sarsa' or 'q', got {self.rule!r}")
         if self.exploration not in ("epsilon", "boltzmann"):
             raise ValueError(f"exploration must be 'epsilon' or 'boltzmann', got {self.exploration!r}")
-        if self.rehearse < 0 or (self.rehearse and self.exploration != "epsilon"):
-            raise ValueError(
-                "rehearse must be at least 0, and 0 unless exploration is 'epsilon', "
-                f"got {self.rehearse} with {self.exploration!r}"
-            )
 
 
 @pytree
@@ -150,20 +142,6 @@ def choose(
     if config.sticky == 0:
         return action, explored
     return jnp.where(explored & (uniforms[2] < config.sticky) & (last >= 0), last, action), explored
-
-
-def rehearsed(config: ControlConfig, uniforms: Array, trial: Array) -> Array:
-    """Return the numbers that choose actions, ``[..., 3]``, so that trials of rehearsal never explore.
-
-    Args:
-        config: the settings.
-        uniforms: ``[..., 3]``.
-        trial: int ``[...]``, the number of the trial that they are for, counted from 0.
-    """
-    if not config.rehearse:
-        return uniforms
-    never = trial % config.rehearse == config.rehearse - 1
-    return uniforms.at[..., 0].set(jnp.where(never, 1, uniforms[..., 0]))
 
 
 def begin(config: ControlConfig, lane: Lane, belief: Array, uniforms: Array) -> Lane:

@@ -184,13 +184,13 @@ class GymAgent:
             left, seed = left - rows["steps"].shape[1], None
             if progress:
                 progress(rows)
-        return _joined(phases)
+        return agents.joined(phases)
 
     def evaluate(self, env: Any, trials: int, *, seed: int = 0) -> dict[str, np.ndarray]:
         """Act greedily without learning; rows as of ``train``. The environment is reset with ``seed``."""
         turns = self._turns(env, trials)
         self._check_copies(turns)
-        greedy = replace(self._learner.config.control, schedule=agents.GREEDY, exploration="epsilon")
+        greedy = agents.settled(self._learner.config.control)
         family, state = self._learner.family, self.state
         _, new = play(
             family, greedy, state.params, state.actor, turns, trials=trials, seed=seed, learning=False
@@ -224,17 +224,16 @@ class GymAgent:
         return self._actions.first + int(action)
 
     def _phase(self, turns: SingleTurns | VectorTurns, most: int, seed: int | None) -> dict[str, np.ndarray]:
-        """Run the trials up to the next offline phase, at most ``most``, and learn."""
+        """Run the trials up to the rehearsals or the next offline phase, at most ``most``, and learn."""
         state, config = self.state, self._learner.config
-        every = config.learner.trials_per_phase
-        trials = min(most, every - int(np.max(np.asarray(state.actor.trials))) % every)
-        blind = self._learner.blind(state)
-        acting = (
-            replace(config.control, schedule=RANDOM, exploration="epsilon", sticky=0.0)
-            if blind
-            else config.control
-        )
-        options = {"trials": trials, "seed": seed, "learning": not blind}
+        every, rehearsals = config.learner.trials_per_phase, config.learner.rehearsals
+        done = int(np.max(np.asarray(state.actor.trials))) % every
+        rehearsing, blind = done >= every - rehearsals, self._learner.blind(state)
+        trials = min(most, (every if rehearsing else every - rehearsals) - done)
+        acting = agents.settled(config.control) if rehearsing else config.control
+        if blind:
+            acting = replace(config.control, schedule=RANDOM, exploration="epsilon", sticky=0.0)
+        options = {"trials": trials, "seed": seed, "learning": not (blind or rehearsing)}
         actor, new = play(self._learner.family, acting, state.params, state.actor, turns, **options)
         self.state, rows = self._learner.take_in(state, actor, new)
         self._belief = None
@@ -270,8 +269,3 @@ def _spaces_of(env: Any) -> tuple[Any, Any]:
 
 def _described(channel: ChannelSpec) -> str:
     return f"{channel.name}: {channel.size} {'values' if channel.kind == 'categorical' else 'real numbers'}"
-
-
-def _joined(phases: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    names = ("steps", "reward", "discounted", "success")
-    return {name: np.concatenate([rows[name] for rows in phases], axis=1) for name in names}

@@ -42,7 +42,6 @@ def _react(
         uniforms = jax.random.uniform(
             jax.random.fold_in(jax.random.fold_in(key, trial), t), (control.UNIFORMS_PER_CHOICE,)
         )
-        uniforms = control.rehearsed(config, uniforms, trial)
         belief = next_belief(family, memory, lane.belief, lane.action, turn.observations)
         rate = jnp.float32(config.alpha if learning else 0)
         outcome = (turn.reward, turn.terminated, turn.ended)

@@ -52,6 +52,9 @@ class LearnerConfig:
     """Baum-Welch, tests and replay see this many last trials."""
     trials_per_phase: int = 50
     """Trials between offline phases."""
+    rehearsals: int = 0
+    """So many of them, the last, are as at the end: greedy, and the values stay as they are. They find out a
+    policy that goes round in circles unless exploration, or learning on the way, frees it."""
     em_iterations: int = 3
     """Baum-Welch iterations in a phase, before any split."""
     split_iterations: int = 1
@@ -96,6 +99,11 @@ class LearnerConfig:
         for name, bound in least.items():
             if getattr(self, name) < bound:
                 raise ValueError(f"{name} must be at least {bound}, got {getattr(self, name)}")
+        if not 0 <= self.rehearsals < self.trials_per_phase:
+            raise ValueError(
+                f"rehearsals must be from 0 to trials_per_phase - 1 = {self.trials_per_phase - 1}, "
+                f"got {self.rehearsals}"
+            )
         if self.initial not in ("observation", "random"):
             raise ValueError(f"initial must be 'observation' or 'random', got {self.initial!r}")
         if not 0 <= self.probation <= self.keep_best:

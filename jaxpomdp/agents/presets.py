@@ -120,8 +120,13 @@ HUDHMM = AgentConfig(
 """The hierarchical agent in the 89-state maze (thesis 6.4.2): 20 to 100 states, operators in turn."""
 
 HUDHMM_TMAZE = AgentConfig(
-    replace(TMAZE.control, rehearse=5),
-    replace(TMAZE.learner, probation=15, policy=PolicyConfig(node_cap=20, edits_per_phase=1, order="rotate")),
+    TMAZE.control,
+    replace(
+        TMAZE.learner,
+        rehearsals=1,
+        probation=15,
+        policy=PolicyConfig(node_cap=20, edits_per_phase=1, order="rotate"),
+    ),
     HierarchicalModel(
         levels=1,
         vertical_by_action=True,

@@ -88,13 +88,11 @@ def next_belief(
     return observe(propagate(belief, memory.trans, action), log_obs)[0]
 
 
-def _draws(config: ControlConfig, keys: Array, first: Array, trials: int, limit: int) -> Array:
+def _draws(keys: Array, first: Array, trials: int, limit: int) -> Array:
     """Return uniforms ``[S, trials + 1, limit + 1, u]`` of (seed, trial, step); row 0 is for the reset."""
     numbers = first[:, None] + jnp.arange(trials + 1)[None, :]
     of_trial = jax.vmap(jax.vmap(jax.random.fold_in, in_axes=(None, 0)))(keys, numbers)
-    draws = jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (limit + 1, _DRAWS))))(of_trial)
-    world, choice = jnp.split(draws, [worlds.UNIFORMS_PER_STEP], axis=-1)
-    return jnp.concatenate([world, control.rehearsed(config, choice, numbers[..., None])], axis=-1)
+    return jax.vmap(jax.vmap(lambda key: jax.random.uniform(key, (limit + 1, _DRAWS))))(of_trial)
 
 
 def _reset(
@@ -216,7 +214,7 @@ def _run(
     plan: str,
 ) -> tuple[Actor, Log, Array]:
     memory = jax.vmap(partial(memory_of, family))(params)
-    draws = _draws(config, actor.keys, actor.trials, trials, world.step_limit)
+    draws = _draws(actor.keys, actor.trials, trials, world.step_limit)
     rate = config.alpha if learning else 0.0
     run = _natively if plan == "native" else _in_a_loop
     q, steps, log, count = run(family, config, rate, world, trials, memory, actor, draws)

@@ -14,6 +14,7 @@ from jaxpomdp.agents.agent import Agent, AgentConfig, make_agent
 from jaxpomdp.agents.control import ControlConfig, Schedule
 from jaxpomdp.agents.presets import TMAZE, UDHMM
 from jaxpomdp.agents.settings import with_settings
+from jaxpomdp.agents.trial import run_trials
 from jaxpomdp.envs.tmaze import tmaze
 from jaxpomdp.experiments import arrays
 from jaxpomdp.models import init as starts
@@ -135,6 +136,29 @@ def test_the_best_score_is_the_best_standing_so_far(run):
     for state, best in zip(run.states[1:], np.maximum.accumulate(averages), strict=True):
         np.testing.assert_allclose(state.best.score, best)
     np.testing.assert_array_equal(run.states[-1].recent, run.rows[-1]["discounted"])
+
+
+def test_rehearsals_come_last_are_greedy_and_teach_no_values():
+    agent = small(rehearsals=2, schedule=Schedule(1.0, 1.0, 1, "constant"))
+    state = agent.init(SEEDS)
+    state = state._replace(actor=replace(state.actor, q=state.actor.q.at[..., 2].set(50)))
+    actor, (explored, rehearsed) = agent._act(state)
+    free = run_trials(agent.family, agent.config.control, WORLD, state.params, state.actor, trials=4)[0]
+    np.testing.assert_array_equal(actor.q, free.q)
+    np.testing.assert_array_equal(actor.trials, 6)
+    for some, others in zip(explored, rehearsed, strict=True):
+        assert (len(some.lengths), len(others.lengths)) == (4, 2)
+        made = np.delete(others.actions, np.cumsum(others.lengths) - 1)
+        assert (made == 2).all()
+        assert not (some.actions == 2).all()
+    after, rows = agent.run(state)
+    assert rows["steps"].shape == (3, 6)
+    np.testing.assert_array_equal(after.experience.lengths[:, -6:] - 1, rows["steps"])
+
+
+def test_a_phase_of_rehearsals_alone_is_refused():
+    with pytest.raises(ValueError, match="rehearsals must be from 0 to trials_per_phase - 1 = 5, got 6"):
+        small(rehearsals=6)
 
 
 def test_finish_goes_back_where_an_earlier_policy_was_better(run):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium
 import jax
 import numpy as np
@@ -165,6 +167,23 @@ def test_a_tabular_world_is_learned_through_gymnasium():
     agent = GymAgent(env, CONFIG)
     rows = agent.train(env, 36, seed=0)
     assert rows["steps"][:, -6:].mean() < rows["steps"][:, :6].mean()
+
+
+def test_rehearsals_in_gymnasium_teach_no_values_and_end_the_phase():
+    import jaxpomdp.envs.gym  # noqa: F401
+
+    env = gymnasium.make_vec("jaxpomdp/TMaze-v0", num_envs=2, length=1, step_limit=8)
+    config = replace(CONFIG, learner=replace(CONFIG.learner, rehearsals=2))
+    agent, phases = GymAgent(env, config), []
+    exploring = config.learner.trials_per_phase - 2
+    agent.train(env, exploring, seed=0)
+    before = agent.state
+    agent.train(env, 1)
+    np.testing.assert_array_equal(agent.state.actor.q, before.actor.q)
+    rows = agent.train(env, 1 + exploring + 2, progress=lambda row: phases.append(row["steps"].shape[1]))
+    assert phases == [1, exploring, 2]
+    assert rows["steps"].shape == (2, exploring + 3)
+    assert not np.array_equal(agent.state.actor.q, before.actor.q)
 
 
 def test_spaces_that_cannot_be_learned_are_refused():

@@ -122,31 +122,6 @@ def test_exploration_is_where_its_number_says(usual):
     assert explored > 5
 
 
-@pytest.mark.parametrize("plan", ["loop", "auto"])
-def test_a_rehearsal_never_explores_and_changes_no_other_trial(plan):
-    """Of trials 2, 3, 4 one in two is a rehearsal: 3."""
-    config = replace(CONTROL, alpha=0.0, schedule=Schedule(1.0, 1.0, 1, "constant"))
-    actor = replace(actor_of(SEEDS), q=actor_of(SEEDS).q.at[..., 2].set(1))
-    usual, rehearsed = (
-        split_log(*run_trials(FLAT, c, WORLD, models_of(SEEDS), actor, trials=TRIALS, plan=plan)[1:])
-        for c in (config, replace(config, rehearse=2))
-    )
-    for free, greedy in zip(usual, rehearsed, strict=True):
-        free, greedy = (np.split(t.actions, np.cumsum(t.lengths)[:-1]) for t in (free, greedy))
-        assert (greedy[1][:-1] == 2).all()
-        assert not np.array_equal(free[1], greedy[1])
-        for k in (0, 2):
-            np.testing.assert_array_equal(free[k], greedy[k])
-
-
-@pytest.mark.parametrize("wrong", [{"rehearse": -1}, {"rehearse": 5, "exploration": "boltzmann"}])
-def test_a_rehearsal_without_meaning_is_refused(wrong):
-    with pytest.raises(
-        ValueError, match="rehearse must be at least 0, and 0 unless exploration is 'epsilon'"
-    ):
-        ControlConfig(**wrong)
-
-
 def beliefs_of(params, trials, s):
     """Filter a seed's trials in plain float64."""
     start, trans = np.exp(np.float64(params.log_init[s])), np.exp(np.float64(params.log_trans[s]))

@@ -120,7 +120,7 @@ def coupled_estep(
     Raises:
         ValueError: an argument of another shape or dtype.
 
-    Source: thesis section 6.3.5.
+    Source: thesis section 3.4; Brand (1997) for the factored form.
     """
     if jnp.ndim(trans[0]) != 5 or jnp.ndim(actions) != 3:
         shapes = f"{list(jnp.shape(trans[0]))} and {list(jnp.shape(actions))}"
