@@ -28,9 +28,12 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Settings of the hierarchical agent; the first tree is diverse where not said otherwise."""
 
+UNAIDED = {"rehearsals": 0, "probation": 0}
+"""What is to be compared is structure: policies are judged as those of the flat agent are."""
+
 WORLDS = {
     "T-maze, N = 10": (
-        replace(fig_6_7.run(10, "hudhmm-tmaze", **fig_6_7.AS_THE_THESIS), trials=1000),
+        replace(fig_6_7.run(10, "hudhmm-tmaze", **fig_6_7.AS_THE_THESIS, **UNAIDED), trials=1000),
         "udhmm-tmaze",
         fig_6_7.EXPERIMENT.criterion,
         60,
