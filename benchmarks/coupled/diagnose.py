@@ -1,6 +1,6 @@
 """Why do coupled agents fail in the hallway? Two suspects, measured at checkpoints of every seed.
 
-    python benchmarks/coupled/diagnose.py --seeds 0 1 2 3
+    python benchmarks/coupled/diagnose.py
 
 - *Acting lacks what learning has.* Learning sees both strands and the return, acting strand 0 alone. From the
   window of trials that learning sees: the mutual information ``I(o'; r | o, a)`` that strand 1 has about
@@ -10,7 +10,7 @@
   whether the gate holds the model, which then learns no more.
 
 The controls: no return modelled (``theta = 0``); couplings frozen at even rows, where the strands are apart;
-one trial in five without exploration (rehearsals); and the flat agent. Writes ``coupled-diagnosis.json`` and
+one trial in five as at the end (rehearsals); and the flat agent. Writes ``coupled-diagnosis.json`` and
 ``.png`` to ``benchmarks/results``.
 """
 
@@ -82,7 +82,7 @@ def variants() -> dict[str, AgentConfig]:
     for name in ("product", "mixture"):
         agent = agents[name]
         agents[f"{name}, theta 0"] = replace(agent, learner=replace(agent.learner, theta=0.0))
-        agents[f"{name}, rehearsals"] = replace(agent, control=replace(agent.control, rehearse=5))
+        agents[f"{name}, rehearsals"] = replace(agent, learner=replace(agent.learner, rehearsals=1))
     return agents
 
 
@@ -200,7 +200,7 @@ def _gap(row: dict[str, Any]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3])
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(12)))
     parser.add_argument("--trials", type=int, default=300)
     parser.add_argument("--every", type=int, default=50)
     parser.add_argument("--only", nargs="*", default=list(variants()))
