@@ -19,8 +19,8 @@ from jax import lax
 from jaxpomdp._types import Array
 from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior, where_valid
 from jaxpomdp.kernels.filtering import EXACT, linked_steps, observe, trial_starts
-from jaxpomdp.kernels.smoothing import relative_likelihood
-from jaxpomdp.numerics import normalise
+from jaxpomdp.kernels.smoothing import heeded_rows
+from jaxpomdp.numerics import normalise, safe_log
 
 Rows = tuple[Array, ...]
 
@@ -161,7 +161,8 @@ def _sweep(
 ) -> tuple[Array, _Swept]:
     """Sweep one tape: its log-evidence, and what each step adds to the counts; gamma is zero at padding."""
     filtered = filter_marginals(chain, log_obs, actions, start, valid)
-    weight = tuple(relative_likelihood(row, valid) for row in log_obs)
+    seen = zip(filtered.predicted, log_obs, strict=True)
+    weight = tuple(jnp.exp(heeded_rows(safe_log(predicted), row)) for predicted, row in seen)
     trans = tuple(map(jnp.exp, chain.log_trans))
     swept = _backward(trans, weight, filtered.belief, actions, linked_steps(start, valid))
     gamma = tuple(where_valid(valid, x) for x in swept.gamma)

@@ -1,10 +1,10 @@
 """Evaluation plans of coupled chains: the posterior of many models on many tapes, whichever plan runs.
 
-- ``scan`` is the definition: ``smooth_joint`` under two maps.
-- ``native`` is the same in C++ (``native``), on CPU in float32 where it could be built.
+- ``scan`` is the definition: ``smooth_joint``, or approximately ``smooth_marginals``, mapped.
+- ``native`` is the same in C++ (``native``) for two chains, on CPU in float32 where it could be built.
 - ``auto`` takes ``native`` where it can, and ``scan`` elsewhere.
 
-Neither has an array of the size of a pair times a pair.
+None has an array of the size of a pair times a pair.
 """
 
 from __future__ import annotations
@@ -41,33 +41,40 @@ def _turned(tables: Rows) -> Rows:
     return tuple(jnp.swapaxes(table, 2, 3) for table in tables[::-1])
 
 
-def _native_plan(chains: CoupledChain, log_obs: Rows, actions: Array, *flags: Array) -> CoupledPosterior:
-    """Hand the batch to the C++ loop, the larger chain last, whose states fill its vectors."""
+def _in_native(
+    kernel: Any, chains: CoupledChain, log_obs: Rows, actions: Array, *flags: Array
+) -> CoupledPosterior:
+    """Hand the batch to a C++ loop, the larger chain last, whose states fill its vectors."""
     if chains.log_init[0].shape[-1] > chains.log_init[1].shape[-1]:
         turned = CoupledChain(chains.log_init[::-1], _turned(chains.log_trans))
-        seen = _native_plan(turned, log_obs[::-1], actions, *flags)
+        seen = _in_native(kernel, turned, log_obs[::-1], actions, *flags)
         return CoupledPosterior(seen.log_evidence, seen.gamma[::-1], _turned(seen.xi), seen.initial[::-1])
     init, trans = (tuple(map(jnp.exp, tables)) for tables in chains)
-    return native.coupled_estep(init, trans, log_obs, actions.astype(jnp.int32), *flags)
+    return kernel(init, trans, log_obs, actions.astype(jnp.int32), *flags)
 
 
-_PLANS = {"scan": partial(_mapped, smooth_joint), "native": _native_plan}
+_EXACT = {"scan": partial(_mapped, smooth_joint), "native": partial(_in_native, native.coupled_estep)}
+_MARGINAL = {
+    "scan": jax.vmap(smooth_marginals_of_tapes),
+    "native": partial(_in_native, native.marginal_estep),
+}
 
-PLANS = ("auto", *_PLANS)
-"""Names of the evaluation plans of exact inference."""
+PLANS = ("auto", *_EXACT)
+"""Names of the evaluation plans, of exact inference and of the sweep over marginals."""
 
 
 def choose_plan(plan: str, chains: CoupledChain) -> str:
     """Resolve ``auto``, and check that a named plan can run here.
 
     Raises:
-        ValueError: ``plan`` is not known or cannot run here, or there are not two chains.
+        ValueError: ``plan`` is not known or cannot run here.
     """
     if plan not in PLANS:
         raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    check_two(chains)
-    dtype = chains.log_init[0].dtype
-    fits = dtype == jnp.float32 and native.available()
+    number, dtype = len(chains.log_init), chains.log_init[0].dtype
+    if plan == "native" and number != 2:
+        raise ValueError(f"plan 'native' needs two chains, got {number}")
+    fits = number == 2 and dtype == jnp.float32 and native.available()
     if plan == "native" and not fits:
         raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
     if plan == "auto":
@@ -76,8 +83,13 @@ def choose_plan(plan: str, chains: CoupledChain) -> str:
 
 
 @partial(jax.jit, static_argnames="plan")
-def _posterior(chains: CoupledChain, *tapes: Any, plan: str) -> CoupledPosterior:
-    return _PLANS[plan](chains, *tapes)
+def _exact(chains: CoupledChain, *tapes: Any, plan: str) -> CoupledPosterior:
+    return _EXACT[plan](chains, *tapes)
+
+
+@partial(jax.jit, static_argnames="plan")
+def _marginal(chains: CoupledChain, *tapes: Any, plan: str) -> CoupledPosterior:
+    return _MARGINAL[plan](chains, *tapes)
 
 
 def coupled_posterior(
@@ -100,21 +112,31 @@ def coupled_posterior(
         ValueError: ``plan`` is not known or cannot run here, there are not two chains, or the shapes do not
             fit.
     """
+    check_two(chains)
     chosen = choose_plan(plan, chains)
     _check_shapes(chains, log_obs, actions, start, valid)
-    return _posterior(chains, log_obs, actions, start, valid, plan=chosen)
+    return _exact(chains, log_obs, actions, start, valid, plan=chosen)
 
 
-@partial(jax.jit, static_argnames="plan")
 def marginal_posterior(
     chains: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array, *, plan: str = "auto"
 ) -> CoupledPosterior:
     """Smooth as ``coupled_posterior`` but approximately, and any number of chains: ``smooth_marginals``.
 
-    There is one plan; ``plan`` is taken for the sake of the signature.
+    Args:
+        chains: ``log_init[c][S, N_c]``, ``log_trans[c][S, A, N_1, ..., N_C, N_c]``.
+        log_obs: ``[S, B, T, N_c]`` for each chain.
+        actions: int ``[S, B, T]``.
+        start: bool ``[S, B, T]``.
+        valid: bool ``[S, B, T]``.
+        plan: one of ``PLANS``; ``native`` takes two chains.
+
+    Raises:
+        ValueError: ``plan`` is not known or cannot run here, or the shapes do not fit.
     """
+    chosen = choose_plan(plan, chains)
     _check_shapes(chains, log_obs, actions, start, valid)
-    return jax.vmap(smooth_marginals_of_tapes)(chains, log_obs, actions, start, valid)
+    return _marginal(chains, log_obs, actions, start, valid, plan=chosen)
 
 
 def _check_shapes(chains: CoupledChain, log_obs: Rows, actions: Array, start: Array, valid: Array) -> None:

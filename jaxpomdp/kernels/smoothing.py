@@ -173,7 +173,7 @@ def _backward_exact(
     return future, xi
 
 
-def _heeded_rows(predicted: Array, log_obs: Array) -> Array:
+def heeded_rows(predicted: Array, log_obs: Array) -> Array:
     """Shift rows by the best likelihood within reach; ``NEG`` out of reach, zeros at an impossible step."""
     reachable = predicted > NEG / 2
     best = jnp.max(jnp.where(reachable, log_obs, NEG), axis=-1, keepdims=True)
@@ -195,7 +195,7 @@ def smooth_exact(chain: Chain, log_obs: Array, actions: Array, start: Array, val
     """Smooth one tape in logarithms: the textbook definition, slow and exact; arguments as ``smooth``."""
     linked = linked_steps(start, valid)
     filtered = filter_exact(chain, log_obs, actions, start, valid)
-    rows = _heeded_rows(filtered.predicted, log_obs)
+    rows = heeded_rows(filtered.predicted, log_obs)
     future, xi = _backward_exact(chain.log_trans, rows, filtered.belief, actions, linked)
     gamma = jax.vmap(_shares)(filtered.predicted + future)
     initial = jnp.sum(jnp.where(trial_starts(start, valid)[:, None], gamma, 0), axis=0)

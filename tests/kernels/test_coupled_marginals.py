@@ -11,6 +11,7 @@ from jaxpomdp.kernels.coupled import CoupledChain
 from jaxpomdp.kernels.coupled_exact import smooth_joint
 from jaxpomdp.kernels.coupled_marginals import filter_marginals, smooth_marginals, update_marginals
 from jaxpomdp.kernels.smoothing import smooth
+from jaxpomdp.numerics import NEG
 from tests.kernels.coupled_problems import CoupledProblem, random_coupled, stack_coupled
 from tests.kernels.problems import log_of, quick_jit, random_problem, random_rows
 from tests.oracles.coupled import enumerate_coupled
@@ -29,6 +30,14 @@ def coupled_by(strength: float, seed: int, sizes: tuple[int, ...] = (3, 2), **op
         shape = [table.shape[0], *(n if k == c else 1 for k, n in enumerate(sizes)), sizes[c]]
         tables.append(log_of((1 - strength) * own.reshape(shape) + strength * np.exp(table)))
     return problem._replace(log_trans=tuple(tables))
+
+
+def with_a_dead_state(problem: CoupledProblem, last: int) -> CoupledProblem:
+    """Let nothing lead to the first chain's last state."""
+    for table in (problem.log_init[0], problem.log_trans[0]):
+        table[..., 0] = np.logaddexp(table[..., 0], table[..., last])
+        table[..., last] = NEG
+    return problem
 
 
 def assert_equal(got, want) -> None:
@@ -97,6 +106,17 @@ def test_counts_agree_and_nothing_is_nan() -> None:
     for gamma, xi in zip(got.gamma, got.xi, strict=True):
         np.testing.assert_allclose(gamma.sum(axis=-1), valid, rtol=1e-5)
         assert float(xi.sum()) == pytest.approx(moves, rel=1e-4)
+
+
+@pytest.mark.usefixtures("x64")
+def test_an_observation_that_no_state_within_reach_allows_is_ignored_both_ways() -> None:
+    problem = with_a_dead_state(random_coupled(3), last=2)
+    problem.log_obs[0][-1] = [NEG, NEG, 0.0]
+    silent = random_coupled(3).log_obs[0]
+    silent[-1] = 0
+    got = sweep(*problem.jax())
+    want = sweep(*problem._replace(log_obs=(silent, problem.log_obs[1])).jax())
+    assert_equal(got, want._replace(log_evidence=want.log_evidence + NEG))
 
 
 @pytest.mark.usefixtures("x64")

@@ -11,7 +11,7 @@ import pytest
 
 from jaxpomdp.kernels import native
 from jaxpomdp.kernels.coupled import CoupledChain, CoupledPosterior
-from jaxpomdp.kernels.coupled_plans import choose_plan, coupled_posterior
+from jaxpomdp.kernels.coupled_plans import choose_plan, coupled_posterior, marginal_posterior
 from jaxpomdp.numerics import NEG
 from tests.kernels.coupled_problems import CoupledProblem, random_coupled, stack_coupled
 from tests.kernels.problems import quick_jit
@@ -21,6 +21,9 @@ from tests.kernels.test_native import Tapes, by_numpy
 needs_native = pytest.mark.skipif(not native.available(), reason="needs a compiler for the native kernels")
 by_scan = quick_jit(partial(coupled_posterior, plan="scan"))
 by_native = jax.jit(partial(coupled_posterior, plan="native"))
+sweep_by_scan = quick_jit(partial(marginal_posterior, plan="scan"))
+sweep_by_native = jax.jit(partial(marginal_posterior, plan="native"))
+either_native = pytest.mark.parametrize("by_native", [by_native, sweep_by_native], ids=["exact", "marginal"])
 HARD = {"starts": 0.1, "missing": 0.2, "padding": 3, "zeros": 0.4, "scale": 2.0}
 
 
@@ -91,8 +94,7 @@ def test_a_tape_that_underflows_is_repaired_and_the_others_are_untouched() -> No
     assert_same(by_native(*inputs), by_pairs(*inputs))
 
 
-@needs_native
-def test_impossible_steps_and_dead_states() -> None:
+def hopeless() -> tuple:
     """Spare states that nothing leads to; steps that no state, or no state within reach, allows."""
     problems = batch(2, 4, sizes=(5, 4), steps=12, zeros=0.3, scale=20.0)
     rng = np.random.default_rng(0)
@@ -104,11 +106,19 @@ def test_impossible_steps_and_dead_states() -> None:
                     table[..., last] = NEG
                 problem.log_obs[c][rng.random(problem.log_obs[c].shape) < 0.2] = NEG
             problem.log_obs[0][3] = NEG
-    inputs = stack_coupled(problems, np.float32)
-    got = by_native(*inputs)
+    return stack_coupled(problems, np.float32)
+
+
+def spares_nothing(got: CoupledPosterior) -> bool:
+    return not any(x[..., -1].any() for x in (*got.gamma, *got.xi, *got.initial))
+
+
+@needs_native
+def test_impossible_steps_and_dead_states() -> None:
+    got = by_native(*hopeless())
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(got))
-    assert not any(x[..., -1].any() for x in (*got.gamma, *got.xi, *got.initial))
-    assert_same(got, by_pairs(*inputs))
+    assert spares_nothing(got)
+    assert_same(got, by_pairs(*hopeless()))
 
 
 @needs_native
@@ -121,7 +131,8 @@ def test_the_oracle_notices_an_action_that_comes_a_step_late() -> None:
 
 
 @needs_native
-def test_what_lies_in_the_padding_does_not_matter() -> None:
+@either_native
+def test_what_lies_in_the_padding_does_not_matter(by_native) -> None:
     clean = stack_coupled(batch(2, 5, padding=2), np.float32)
     chains, rows, actions, start, valid = clean
     spoilt = tuple(jnp.where(valid[..., None], x, jnp.nan) for x in rows), jnp.where(valid, actions, 77)
@@ -129,7 +140,8 @@ def test_what_lies_in_the_padding_does_not_matter() -> None:
 
 
 @needs_native
-def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+@either_native
+def test_results_do_not_depend_on_the_number_of_threads(by_native, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = stack_coupled(batch(3, 11, sizes=(9, 5), steps=30), np.float32)
     results = []
     for threads in (1, 2, 5):
@@ -140,18 +152,20 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
 
 
 @needs_native
-def test_it_works_under_vmap() -> None:
+@either_native
+def test_it_works_under_vmap(by_native) -> None:
     chains, rows, *rest = stack_coupled(batch(2, 3), np.float32)
     both = jax.tree.map(lambda x: jnp.stack([x, -x]), rows)
-    mapped = jax.jit(jax.vmap(lambda x: coupled_posterior(chains, x, *rest, plan="native")))(both)
+    mapped = jax.jit(jax.vmap(lambda x: by_native(chains, x, *rest)))(both)
     for k in range(2):
         one = by_native(chains, jax.tree.map(lambda x, k=k: x[k], both), *rest)
         assert_same(jax.tree.map(lambda x, k=k: x[k], mapped), one)
 
 
 @needs_native
+@either_native
 @pytest.mark.parametrize("empty", [(0, 2, 5), (2, 0, 5), (2, 2, 0)], ids=str)
-def test_empty_batches_give_empty_results(empty: tuple[int, ...]) -> None:
+def test_empty_batches_give_empty_results(by_native, empty: tuple[int, ...]) -> None:
     even = CoupledChain(
         (jnp.zeros((empty[0], 3)), jnp.zeros((empty[0], 2))),
         (jnp.zeros((empty[0], 1, 3, 2, 3)), jnp.zeros((empty[0], 1, 3, 2, 2))),
@@ -161,6 +175,78 @@ def test_empty_batches_give_empty_results(empty: tuple[int, ...]) -> None:
     got = by_native(even, rows, jnp.zeros(empty, jnp.int32), flags, flags)
     assert got.gamma[0].shape == (*empty, 3)
     assert not any(np.any(leaf) for leaf in jax.tree.leaves(got))
+
+
+def doubled(inputs: tuple) -> tuple:
+    return jax.tree.map(lambda x: x.astype(float) if x.dtype == jnp.float32 else x, inputs)
+
+
+@needs_native
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("sizes", [(3, 2), (2, 17), (16, 4), (1, 5), (5, 1), (7, 9)], ids=str)
+def test_the_native_sweep_over_marginals_equals_scan_in_both_precisions(sizes: tuple[int, int]) -> None:
+    """As ``test_native_equals_numpy``; more tapes than a chunk, more steps than are counted at once."""
+    inputs = stack_coupled(batch(2, 17, sizes=sizes, actions=3, steps=30, **HARD), np.float32)
+    got = sweep_by_native(*inputs)
+    assert_same(got, sweep_by_scan(*inputs))
+    assert_same(got, sweep_by_scan(*doubled(inputs)))
+
+
+@needs_native
+@pytest.mark.usefixtures("x64")
+def test_the_native_sweep_with_impossible_steps_and_dead_states() -> None:
+    got = sweep_by_native(*hopeless())
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(got))
+    assert spares_nothing(got)
+    assert_same(got, sweep_by_scan(*doubled(hopeless())))
+
+
+def improbable() -> tuple:
+    """Both chains go, each with probability 1e-33, where no float holds the product; sight is as sharp."""
+    problem = random_coupled(0, sizes=(3, 2), steps=12)
+    for table, last in zip(problem.log_trans, (2, 1), strict=True):
+        table[...] = np.log(1 / last)
+        table[..., last] = np.log(1e-33)
+    for row in problem.log_obs:
+        row[4:7] = -76.0
+        row[4:7, -1] = 0.0
+    return stack_coupled([[problem]], np.float32)
+
+
+@needs_native
+@pytest.mark.usefixtures("x64")
+def test_the_native_sweep_loses_nothing_in_products_of_small_numbers() -> None:
+    got, want = sweep_by_native(*improbable()), sweep_by_scan(*doubled(improbable()))
+    assert_same(got, want)
+    assert not np.allclose(sweep_by_scan(*improbable()).xi[0], want.xi[0], atol=1e-2)
+
+
+@needs_native
+@pytest.mark.parametrize("scale", [30.0, 300.0])
+def test_the_native_sweep_is_finite_however_sharp_the_observations(scale: float) -> None:
+    inputs = stack_coupled(batch(2, 5, sizes=(4, 3), steps=14, zeros=0.5, scale=scale), np.float32)
+    got, valid = sweep_by_native(*inputs), inputs[-1]
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(got))
+    for gamma in got.gamma:
+        np.testing.assert_allclose(gamma.sum(axis=-1), valid, rtol=1e-5)
+
+
+@needs_native
+def test_scan_notices_a_native_sweep_whose_actions_come_a_step_late() -> None:
+    chains, rows, actions, *flags = stack_coupled(batch(1, 3), np.float32)
+    late = sweep_by_native(chains, rows, jnp.roll(actions, 1, -1), *flags)
+    with pytest.raises(AssertionError):
+        assert_same(late, sweep_by_scan(chains, rows, actions, *flags))
+
+
+def test_three_chains_have_one_plan() -> None:
+    inputs = stack_coupled([[random_coupled(0, sizes=(2, 3, 2))]], np.float32)
+    assert choose_plan("auto", inputs[0]) == "scan"
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(sweep_by_scan(*inputs)))
+    with pytest.raises(ValueError, match="plan 'native' needs two chains, got 3"):
+        marginal_posterior(*inputs, plan="native")
+    with pytest.raises(ValueError, match=r"plan must be one of .*got 'pairs'"):
+        marginal_posterior(*inputs, plan="pairs")
 
 
 def largest_array(function, *arguments) -> int:
@@ -173,7 +259,8 @@ def largest_array(function, *arguments) -> int:
 def test_no_array_has_the_size_of_a_pair_times_a_pair() -> None:
     """One model, one action, one short tape: all else is smaller than (N_1 N_2)^2."""
     chains, *tapes = stack_coupled([[random_coupled(0, sizes=(6, 5), actions=1, steps=3)]], np.float32)
-    assert largest_array(partial(coupled_posterior, plan="native"), chains, *tapes) == 6 * 5 * 6
+    for kernel in (coupled_posterior, marginal_posterior):
+        assert largest_array(partial(kernel, plan="native"), chains, *tapes) == 6 * 5 * 6
     together = largest_array(lambda one, two: one[..., None] + two[..., None, :], *chains.log_trans)
     assert together == (6 * 5) ** 2
 

@@ -28,10 +28,12 @@ __all__ = [
     "coupled_estep",
     "estep",
     "filter_tapes",
+    "marginal_estep",
     "sarsa_replay",
 ]
 
 RULES = ("sarsa", "q")
+Rows = tuple[Array, Array]
 
 
 def available() -> bool:
@@ -122,6 +124,28 @@ def coupled_estep(
 
     Source: thesis section 3.4; Brand (1997) for the factored form.
     """
+    return _coupled("jaxpomdp_coupled", init, trans, log_obs, actions, start, valid)
+
+
+def marginal_estep(
+    init: tuple[Array, Array],
+    trans: tuple[Array, Array],
+    log_obs: tuple[Array, Array],
+    actions: Array,
+    start: Array,
+    valid: Array,
+) -> CoupledPosterior:
+    """Smooth as ``coupled_estep`` but approximately: ``coupled_marginals.smooth_marginals`` for each tape.
+
+    Source: Boyen and Koller (1998; 1999 for the backward sweep).
+    """
+    return _coupled("jaxpomdp_marginals", init, trans, log_obs, actions, start, valid)
+
+
+def _coupled(
+    kernel: str, init: Rows, trans: Rows, log_obs: Rows, actions: Array, start: Array, valid: Array
+) -> CoupledPosterior:
+    """Check the arguments of a kernel of two chains against one another, and call it."""
     if jnp.ndim(trans[0]) != 5 or jnp.ndim(actions) != 3:
         shapes = f"{list(jnp.shape(trans[0]))} and {list(jnp.shape(actions))}"
         raise ValueError(
@@ -136,7 +160,7 @@ def coupled_estep(
     _check("start", start, batch, jnp.bool_)
     _check("valid", valid, batch, jnp.bool_)
     results = _float32(batch[:2], *(x.shape for x in (*log_obs, *trans, *init)))
-    call = jax.ffi.ffi_call("jaxpomdp_coupled", results, vmap_method="broadcast_all")
+    call = jax.ffi.ffi_call(kernel, results, vmap_method="broadcast_all")
     evidence, *rest = call(*init, *trans, *log_obs, actions, start, valid)
     return CoupledPosterior(evidence, tuple(rest[:2]), tuple(rest[2:4]), tuple(rest[4:]))
 

@@ -18,8 +18,6 @@
 
 namespace {
 
-constexpr Index kChunkTapes = 4;
-
 // A batch of two coupled chains; each array has an entry for each.
 struct CoupledProblem : Batch {
   Index N[2];
@@ -54,6 +52,12 @@ inline float relative(const float* row, float* out, Index N) {
 // One thread's workplace: it takes chunks of tapes of a model one after the other.
 class CoupledWorker {
  public:
+  static constexpr Index kChunk = 4;  // tapes
+  static double multiplications(const CoupledProblem& p) {
+    const double pairs = p.N[0] * p.N[1];
+    return 3.0 * p.S * p.B * p.T * (pairs + 32) * pairs;
+  }
+
   explicit CoupledWorker(const CoupledProblem& problem)
       : p_(problem), one_(problem.N[0]), two_(problem.N[1]), pairs_(one_ * two_), T_(problem.T) {
     row_vecs_ = (two_ + kWidth - 1) / kWidth, pair_vecs_ = (pairs_ + kWidth - 1) / kWidth;

@@ -3,8 +3,8 @@
 // Rows of one model run in step: at each time the rows that took the same action share one small matrix
 // product, and the expected transitions are one product per action over blocks of steps. Probabilities are
 // renormalised at every step; a row where underflow mattered is done again in logarithms and double precision.
-// The semantics are those of kernels/smoothing.py, kernels/filtering.py, kernels/coupled_exact.py and
-// agents/trial.py, the tests' oracles.
+// The semantics are those of kernels/smoothing.py, kernels/filtering.py, kernels/coupled_exact.py,
+// kernels/coupled_marginals.py and agents/trial.py, the tests' oracles.
 
 #include <algorithm>
 #include <cstdint>
@@ -15,6 +15,7 @@
 #include "act.h"
 #include "coupled.h"
 #include "coupled_exact.h"
+#include "coupled_marginals.h"
 #include "exact.h"
 #include "replay.h"
 #include "tapes.h"
@@ -123,7 +124,8 @@ ffi::Error estep(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictiona
 }
 
 // For each chain init, then trans, then log_obs; actions, start, valid. Results: evidence; for each chain gamma,
-// then xi, then initial.
+// then xi, then initial. The worker is that of exact inference or of the sweep over marginals.
+template <class Worker>
 ffi::Error coupled(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary) try {
   const Call call{args, rets};
   CoupledProblem p{};
@@ -138,12 +140,11 @@ ffi::Error coupled(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictio
   p.evidence = call.result(0);
   p.S = call.in(0).element_count() / p.N[0];
   const Index pairs = p.N[0] * p.N[1], cells = p.A * pairs;
-  p.plan_chunks(kChunkTapes, cells * (p.N[0] + p.N[1]));
+  p.plan_chunks(Worker::kChunk, cells * (p.N[0] + p.N[1]));
   Sums xi[] = {{p, call.result(3), cells * p.N[0]}, {p, call.result(4), cells * p.N[1]}};
   Sums initial[] = {{p, call.result(5), p.N[0]}, {p, call.result(6), p.N[1]}};
-  const double work = 3.0 * p.S * p.B * p.T * (pairs + 32) * pairs;
-  const bool fine = parallel(p.S * p.chunks, useful_threads(work), [&] {
-    return [&, worker = std::make_shared<CoupledWorker>(p)](Index unit) {
+  const bool fine = parallel(p.S * p.chunks, useful_threads(Worker::multiplications(p)), [&] {
+    return [&, worker = std::make_shared<Worker>(p)](Index unit) {
       worker->smooth(unit, {{xi[0].of(unit), xi[1].of(unit)}, {initial[0].of(unit), initial[1].of(unit)}});
     };
   });
@@ -204,6 +205,7 @@ auto binding() { return ffi::Ffi::Bind().RemainingArgs().RemainingRets().Attrs()
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpFilter, filter_tapes, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpEstep, estep, binding());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpCoupled, coupled, binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpCoupled, coupled<CoupledWorker>, binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpMarginals, coupled<MarginalWorker>, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpReplay, replay, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpAct, act, binding());
