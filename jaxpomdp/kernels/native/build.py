@@ -26,6 +26,7 @@ TARGETS = {
     "jaxpomdp_estep": "JaxpomdpEstep",
     "jaxpomdp_filter": "JaxpomdpFilter",
     "jaxpomdp_coupled": "JaxpomdpCoupled",
+    "jaxpomdp_memory": "JaxpomdpMemory",
     "jaxpomdp_replay": "JaxpomdpReplay",
     "jaxpomdp_act": "JaxpomdpAct",
 }
