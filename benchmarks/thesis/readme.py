@@ -14,7 +14,9 @@ from jaxpomdp.experiments import thesis
 from jaxpomdp.experiments.reproduce import markdown_table
 
 ROOT = Path(__file__).resolve().parents[2]
-PLACE = re.compile(r"(<!-- (?P<name>(?!end )[a-z]+(?:-[\w.]+)*) -->\n)(?P<table>.*?)(<!-- end -->)", re.DOTALL)
+PLACE = re.compile(
+    r"(<!-- (?P<name>(?!end )[a-z]+(?:-[\w.]+)*) -->\n)(?P<table>.*?)(<!-- end -->)", re.DOTALL
+)
 
 
 def filled(text: str, results: Path) -> str:

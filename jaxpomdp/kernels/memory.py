@@ -14,16 +14,13 @@ starts with its first state remembered. Source: thesis section 6.3.5; the scalin
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
 from jaxpomdp._types import Array, Chain, Posterior
 from jaxpomdp.kernels.filtering import EXACT, linked_steps, observe, trial_starts
-from jaxpomdp.kernels.posterior import posterior
 from jaxpomdp.kernels.smoothing import overlap_floor, relative_likelihood
 from jaxpomdp.numerics import NEG, log_sum_exp
 
@@ -222,77 +219,6 @@ def pair_chain(chain: MemoryChain) -> Chain:
     both = held[None, ..., None] + moved[:, :, None]
     pairs = jnp.maximum(jnp.swapaxes(both, -1, -2).reshape(-1, n * n, n * n), NEG)
     return Chain(jnp.where(same, chain.log_init, NEG).reshape(-1), pairs)
-
-
-PLANS = ("auto", "pairs")
-"""Names of the evaluation plans: ``auto`` leaves pairs alone in models whose memory is asleep."""
-
-
-def memory_posterior(
-    chains: MemoryChain, log_obs: Array, actions: Array, start: Array, valid: Array, *, plan: str = "auto"
-) -> MemoryPosterior:
-    """Smooth ``B`` tapes under each of ``S`` models: ``smooth_pairs`` for many.
-
-    Models are taken one after the other: the forward pass of one holds ``[B, T, N, N]``. A model whose memory
-    is asleep (never heeded, never kept) is the chain alone, and costs what that costs.
-
-    Args:
-        chains: with leading ``S``.
-        log_obs: ``[S, B, T, N]``.
-        actions: int ``[S, B, T]``.
-        start: bool ``[S, B, T]``.
-        valid: bool ``[S, B, T]``.
-        plan: one of ``PLANS``; both give the same up to rounding.
-
-    Returns:
-        ``log_evidence[S, B]``, ``gamma`` and ``held`` ``[S, B, T, N]``; the rest are sums over the tapes.
-
-    Raises:
-        ValueError: ``plan`` is not known, or the shapes do not fit.
-    """
-    if plan not in PLANS:
-        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    for name, array in {"actions": actions, "start": start, "valid": valid}.items():
-        if array.shape != log_obs.shape[:3]:
-            raise ValueError(f"{name} must have shape {log_obs.shape[:3]} as log_obs, got {array.shape}")
-    if chains.log_init.shape != (log_obs.shape[0], log_obs.shape[-1]):
-        wanted = (log_obs.shape[0], log_obs.shape[-1])
-        raise ValueError(f"log_init must have shape {wanted}, got {chains.log_init.shape}")
-    return _posterior(chains, log_obs, actions, start, valid, plan=plan)
-
-
-@partial(jax.jit, static_argnames="plan")
-def _posterior(chains: MemoryChain, *tapes: Any, plan: str) -> MemoryPosterior:
-    def of_model(inputs: Any) -> MemoryPosterior:
-        chain, *own = inputs
-        awake = jnp.any(chain.log_heed[:, 1] > NEG / 2) | jnp.any(chain.log_note[:, 1] > NEG / 2)
-        return lax.cond((plan == "pairs") | awake, _of_pairs, _asleep, chain, *own)
-
-    return lax.map(of_model, (chains, *tapes))
-
-
-def _of_pairs(chain: MemoryChain, *tapes: Array) -> MemoryPosterior:
-    """Smooth every tape of one model, and add up the counts."""
-    each = jax.vmap(partial(smooth_pairs, chain))(*tapes)
-    sums = jax.tree.map(lambda x: jnp.sum(x, axis=0), (each.xi, each.initial, each.counts))
-    return each._replace(xi=sums[0], initial=sums[1], counts=sums[2])
-
-
-def _asleep(
-    chain: MemoryChain, log_obs: Array, actions: Array, start: Array, valid: Array
-) -> MemoryPosterior:
-    """Smooth the chain alone: what is remembered is the state one step before."""
-    tapes = (log_obs, actions, start, valid)
-    alone = Chain(chain.log_init[None], chain.log_trans[None])
-    seen = jax.tree.map(lambda x: x[0], posterior(alone, *(x[None] for x in tapes)))
-    starts, linked = trial_starts(start, valid), linked_steps(start, valid)
-    before = jnp.roll(seen.gamma, 1, axis=1)
-    held = jnp.where(valid[..., None], jnp.where(starts[..., None], seen.gamma, before), 0)
-    noted = jnp.sum(jnp.where(linked[..., None], held, 0), axis=(0, 1))
-    left, none = jnp.sum(seen.xi, axis=(0, 2)), jnp.zeros_like(noted)
-    choices = (jnp.stack([x, none], axis=1) for x in (left, noted))
-    counts = MemoryCounts(seen.xi, jnp.zeros_like(seen.xi), *choices)
-    return MemoryPosterior(seen.log_evidence, seen.gamma, seen.xi, seen.initial, held, counts)
 
 
 def state_posterior(seen: MemoryPosterior) -> Posterior:

@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array, Chain, TrialBatch, pytree
-from jaxpomdp.kernels.memory import MemoryChain, MemoryPosterior, memory_posterior, state_posterior
+from jaxpomdp.kernels.memory import MemoryChain, MemoryPosterior, state_posterior
+from jaxpomdp.kernels.memory_plans import memory_posterior
 from jaxpomdp.models import estimates
 from jaxpomdp.models.checks import check_data
 from jaxpomdp.models.estimates import check_rows

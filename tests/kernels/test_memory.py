@@ -10,7 +10,7 @@ import pytest
 from jaxpomdp._types import Chain
 from jaxpomdp.kernels import memory
 from jaxpomdp.kernels.decoding import viterbi
-from jaxpomdp.kernels.memory import MemoryChain, memory_posterior, pair_chain, smooth_pairs
+from jaxpomdp.kernels.memory import MemoryChain, pair_chain, smooth_pairs
 from jaxpomdp.kernels.sampling import sample_path
 from jaxpomdp.kernels.smoothing import smooth
 from jaxpomdp.numerics import NEG
@@ -101,35 +101,6 @@ def test_a_memory_that_always_notes_is_a_second_flat_chain() -> None:
 
 
 @pytest.mark.usefixtures("x64")
-def test_a_memory_asleep_costs_nothing_and_changes_nothing() -> None:
-    """One of two models is asleep: both plans agree on everything."""
-    problems = [
-        random_memory(s, steps=30, states=4, starts=0.2, missing=0.1, padding=2).jax() for s in range(2)
-    ]
-    sure = jnp.tile(jnp.array([0.0, NEG]), (4, 1))
-    chains = [problems[0][0]._replace(log_heed=sure, log_note=sure), problems[1][0]]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *chains)
-    tapes = [jnp.stack(x)[:, None] for x in zip(*(tape for _, tape in problems), strict=True)]
-    auto, pairs = (memory_posterior(stacked, *tapes, plan=plan) for plan in ("auto", "pairs"))
-    for name, x, y in zip(auto._fields, auto, pairs, strict=True):
-        for left, right in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
-            np.testing.assert_allclose(left, right, atol=1e-10, err_msg=name)
-
-
-def test_many_models_and_tapes_are_each_alone() -> None:
-    problems = [[random_memory(2 * s + b, steps=12, starts=0.2, padding=b).jax(np.float32) for b in range(2)]
-                for s in range(3)]  # fmt: skip
-    chains = jax.tree.map(lambda *x: jnp.stack(x), *(row[0][0] for row in problems))
-    tapes = [jax.tree.map(lambda *x: jnp.stack(x), *(p[1] for p in row)) for row in problems]
-    seen = memory_posterior(chains, *jax.tree.map(lambda *x: jnp.stack(x), *tapes))
-    for s, row in enumerate(problems):
-        alone = [smooth_pairs(row[0][0], *tape) for _, tape in row]
-        np.testing.assert_allclose(seen.gamma[s], jnp.stack([x.gamma for x in alone]), atol=1e-5)
-        np.testing.assert_allclose(seen.counts.note[s], sum(x.counts.note for x in alone), atol=1e-4)
-        np.testing.assert_allclose(seen.xi[s], sum(x.xi for x in alone), atol=1e-4)
-
-
-@pytest.mark.usefixtures("x64")
 def test_impossible_steps_and_spare_states_give_numbers() -> None:
     """An observation that no state can make is a missing one; absent states get nothing."""
     problem = random_memory(8, steps=8, states=3)
@@ -171,15 +142,3 @@ def test_best_and_random_paths_come_from_the_pair() -> None:
     drawn = sample_path(jax.random.key(0), pair_chain(keeping), *rest)
     active, held = np.divmod(np.asarray(drawn), 3)
     assert (held == active[0]).all()
-
-
-def test_wrong_arguments_are_named() -> None:
-    chain, tape = random_memory(0, steps=4).jax(np.float32)
-    many = jax.tree.map(lambda x: x[None], chain)
-    tapes = [x[None, None] for x in tape]
-    with pytest.raises(ValueError, match="plan must be one of"):
-        memory_posterior(many, *tapes, plan="native")
-    with pytest.raises(ValueError, match="actions must have shape"):
-        memory_posterior(many, tapes[0], tapes[1][:, :, 1:], *tapes[2:])
-    with pytest.raises(ValueError, match="log_init must have shape"):
-        memory_posterior(many._replace(log_init=many.log_init[:, 1:]), *tapes)

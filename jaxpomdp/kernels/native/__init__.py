@@ -17,6 +17,7 @@ import jax.numpy as jnp
 
 from jaxpomdp._types import Array, Posterior
 from jaxpomdp.kernels.coupled import CoupledPosterior
+from jaxpomdp.kernels.memory import MemoryChain, MemoryCounts, MemoryPosterior
 from jaxpomdp.kernels.native.build import loaded
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "estep",
     "filter_tapes",
     "marginal_estep",
+    "memory_estep",
     "sarsa_replay",
 ]
 
@@ -163,6 +165,40 @@ def _coupled(
     call = jax.ffi.ffi_call(kernel, results, vmap_method="broadcast_all")
     evidence, *rest = call(*init, *trans, *log_obs, actions, start, valid)
     return CoupledPosterior(evidence, tuple(rest[:2]), tuple(rest[2:4]), tuple(rest[4:]))
+
+
+def memory_estep(
+    model: MemoryChain, log_obs: Array, actions: Array, start: Array, valid: Array
+) -> MemoryPosterior:
+    """Smooth all rows of all models with a memory: ``memory.smooth_pairs`` for each, counts summed over rows.
+
+    Time is ``O((K + 1) N^2)`` a step, where ``K`` states of a model are ever kept in memory.
+
+    Args:
+        model: probabilities float32, not logarithms, with leading ``S``; rows of ``note`` sum to one.
+        log_obs: float32 ``[S, B, T, N]``; a missing step is a row of zeros.
+        actions: int32 ``[S, B, T]``; the last of a trial is ignored.
+        start: bool ``[S, B, T]``, first step of a trial.
+        valid: bool ``[S, B, T]``, False at padding.
+
+    Returns:
+        ``log_evidence[S, B]``, ``gamma`` and ``held`` ``[S, B, T, N]``; the rest are sums over the rows.
+
+    Raises:
+        ValueError: an argument of another shape or dtype.
+
+    Source: thesis section 6.3.5.
+    """
+    init, trans, lead, heed, note = model
+    _check_tapes(init, trans, log_obs, actions, start, valid)
+    _check("lead", lead, trans.shape, jnp.float32)
+    for name, choice in (("heed", heed), ("note", note)):
+        _check(name, choice, (*init.shape, 2), jnp.float32)
+    shapes = (actions.shape[:2], log_obs.shape, trans.shape, init.shape, log_obs.shape)
+    results = _float32(*shapes, *(x.shape for x in model[1:]))
+    call = jax.ffi.ffi_call("jaxpomdp_memory", results, vmap_method="broadcast_all")
+    evidence, gamma, xi, initial, held, *counts = call(*model, log_obs, actions, start, valid)
+    return MemoryPosterior(evidence, gamma, xi, initial, held, MemoryCounts(*counts))
 
 
 def filter_tapes(

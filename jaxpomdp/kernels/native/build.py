@@ -27,6 +27,7 @@ TARGETS = {
     "jaxpomdp_filter": "JaxpomdpFilter",
     "jaxpomdp_coupled": "JaxpomdpCoupled",
     "jaxpomdp_marginals": "JaxpomdpMarginals",
+    "jaxpomdp_memory": "JaxpomdpMemory",
     "jaxpomdp_replay": "JaxpomdpReplay",
     "jaxpomdp_act": "JaxpomdpAct",
 }

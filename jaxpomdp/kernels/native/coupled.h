@@ -38,17 +38,6 @@ std::vector<Number*> rows_of(Number* first, Index ld, Index count) {
   return rows;
 }
 
-// out = exp(row - its largest), which it returns.
-inline float relative(const float* row, float* out, Index N) {
-  Vec best = splat(kNeg);
-  sweep(N, [&](Index n, Index count) { best = larger(best, load_first(row + n, count, kNeg)); });
-  const float shift = peak(best);
-  sweep(N, [&](Index n, Index count) {
-    store_first(out + n, count, exp_negative(load_first(row + n, count, kNeg) - splat(shift)));
-  });
-  return shift;
-}
-
 // One thread's workplace: it takes chunks of tapes of a model one after the other.
 class CoupledWorker {
  public:

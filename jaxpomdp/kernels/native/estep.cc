@@ -4,7 +4,7 @@
 // product, and the expected transitions are one product per action over blocks of steps. Probabilities are
 // renormalised at every step; a row where underflow mattered is done again in logarithms and double precision.
 // The semantics are those of kernels/smoothing.py, kernels/filtering.py, kernels/coupled_exact.py,
-// kernels/coupled_marginals.py and agents/trial.py, the tests' oracles.
+// kernels/coupled_marginals.py, kernels/memory.py and agents/trial.py, the tests' oracles.
 
 #include <algorithm>
 #include <cstdint>
@@ -17,6 +17,8 @@
 #include "coupled_exact.h"
 #include "coupled_marginals.h"
 #include "exact.h"
+#include "memory.h"
+#include "memory_exact.h"
 #include "replay.h"
 #include "tapes.h"
 #include "threads.h"
@@ -154,6 +156,37 @@ ffi::Error coupled(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictio
   return done(false);
 }
 
+// init, trans, lead, heed, note, log_obs, actions, start, valid. Results: evidence, gamma, xi, initial, held; counts
+// of chain, lead, heed, note.
+ffi::Error memory(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary) try {
+  const Call call{args, rets};
+  MemoryProblem p{};
+  read_batch(call, 6, p);
+  const auto shape = call.in(1).dimensions();
+  p.N = shape[shape.size() - 1], p.A = shape[shape.size() - 3];
+  p.S = p.N == 0 ? 0 : call.in(0).element_count() / p.N;
+  p.init = call.floats(0), p.trans = call.floats(1), p.lead = call.floats(2), p.heed = call.floats(3);
+  p.note = call.floats(4), p.log_obs = call.floats(5);
+  p.evidence = call.result(0), p.gamma = call.result(1), p.held = call.result(4);
+  const Index square = p.A * p.N * p.N;
+  p.plan_chunks(kMemoryRows, 3 * square);
+  prefer_large_pages(p.gamma, call.out(1).element_count()), prefer_large_pages(p.held, call.out(4).element_count());
+  Sums xi(p, call.result(2), square), initial(p, call.result(3), p.N);
+  Sums chain(p, call.result(5), square), lead(p, call.result(6), square);
+  Sums heed(p, call.result(7), 2 * p.N), note(p, call.result(8), 2 * p.N);
+  const double work = 3.0 * p.S * p.B * p.T * (p.N + 32) * p.N;
+  const bool fine = parallel(p.S * p.chunks, useful_threads(work), [&] {
+    return [&, worker = std::make_shared<MemoryWorker>(p)](Index unit) {
+      worker->smooth(unit, {xi.of(unit), initial.of(unit), chain.of(unit), lead.of(unit), heed.of(unit),
+                            note.of(unit)});
+    };
+  });
+  for (Sums* sums : {&xi, &initial, &chain, &lead, &heed, &note}) sums->merge();
+  return done(fine);
+} catch (const std::bad_alloc&) {
+  return done(false);
+}
+
 // q, beliefs, actions, rewards, start, valid, terminated, settings; result: the new q.
 ffi::Error replay(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictionary choices) {
   const Call call{args, rets};
@@ -207,5 +240,6 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpFilter, filter_tapes, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpEstep, estep, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpCoupled, coupled<CoupledWorker>, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpMarginals, coupled<MarginalWorker>, binding());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpMemory, memory, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpReplay, replay, binding());
 XLA_FFI_DEFINE_HANDLER_SYMBOL(JaxpomdpAct, act, binding());

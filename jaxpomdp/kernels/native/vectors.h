@@ -123,6 +123,17 @@ inline Vec exp_negative(Vec x) {
   return scale_by_power(p * r + 1.0f, n);
 }
 
+// out = exp(row - its largest), which it returns.
+inline float relative(const float* row, float* out, Index N) {
+  Vec best = splat(kNeg);
+  sweep(N, [&](Index n, Index count) { best = larger(best, load_first(row + n, count, kNeg)); });
+  const float shift = peak(best);
+  sweep(N, [&](Index n, Index count) {
+    store_first(out + n, count, exp_negative(load_first(row + n, count, kNeg) - splat(shift)));
+  });
+  return shift;
+}
+
 constexpr Index kTileRows = 6, kTileVecs = 4;
 
 // out[r][c] (+)= sum_k x[r][k * stride] * m[k * ld + c] for R rows and C vectors of columns.
