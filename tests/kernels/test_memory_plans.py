@@ -31,7 +31,7 @@ def batch(models: int, tapes: int, *, awake: tuple[int | None, ...] = (1,), **op
 
 
 def by_pairs(chains: MemoryChain, rows: jax.Array, *rest: jax.Array) -> MemoryPosterior:
-    """Write the pairs down as one chain, in float64 and NumPy, and split each move by what may have made it."""
+    """Write the pairs down as one chain, in float64 NumPy, and split each move by what may have made it."""
     n = rows.shape[-1]
     double = MemoryChain(*(jnp.asarray(np.asarray(x), float) for x in chains))
     init, moves = (np.exp(x) for x in jax.vmap(pair_chain)(double))
