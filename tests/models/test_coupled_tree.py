@@ -232,5 +232,5 @@ def test_errors_name_the_argument() -> None:
     with pytest.raises(ValueError, match=r"params.log_note"):
         fit(COUPLED_TREE, replace(params, log_note=params.log_note * jnp.nan), tapes)
     with pytest.raises(ValueError, match="plan must be one of"):
-        fit(COUPLED_TREE, params, tapes, EMConfig(plan="native"))
+        fit(COUPLED_TREE, params, tapes, EMConfig(plan="scan"))
     assert float(params.log_heed.min()) > NEG / 2

@@ -168,13 +168,14 @@ ffi::Error memory(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Diction
   p.init = call.floats(0), p.trans = call.floats(1), p.lead = call.floats(2), p.heed = call.floats(3);
   p.note = call.floats(4), p.log_obs = call.floats(5);
   p.evidence = call.result(0), p.gamma = call.result(1), p.held = call.result(4);
-  const Index square = p.A * p.N * p.N;
-  p.plan_chunks(kMemoryRows, 3 * square);
+  const Index square = p.A * p.N * p.N, columns = p.most_awake() + 1;
+  const Index affordable = (Index{16} << 20) / std::max<Index>(1, p.T * p.N * columns);  // beliefs in 64 MiB
+  p.plan_chunks(std::clamp<Index>(affordable, 1, kMemoryRows), 3 * square);
   prefer_large_pages(p.gamma, call.out(1).element_count()), prefer_large_pages(p.held, call.out(4).element_count());
   Sums xi(p, call.result(2), square), initial(p, call.result(3), p.N);
   Sums chain(p, call.result(5), square), lead(p, call.result(6), square);
   Sums heed(p, call.result(7), 2 * p.N), note(p, call.result(8), 2 * p.N);
-  const double work = 3.0 * p.S * p.B * p.T * (p.N + 32) * p.N;
+  const double work = 3.0 * p.S * p.B * p.T * (p.N + 32) * p.N * columns;
   const bool fine = parallel(p.S * p.chunks, useful_threads(work), [&] {
     return [&, worker = std::make_shared<MemoryWorker>(p)](Index unit) {
       worker->smooth(unit, {xi.of(unit), initial.of(unit), chain.of(unit), lead.of(unit), heed.of(unit),

@@ -20,13 +20,24 @@
 
 namespace {
 
-constexpr Index kMemoryRows = 16, kMemoryBlock = 32;
+constexpr Index kMemoryRows = 32, kMemoryBlock = 32;
 
 // A batch of chains with a memory, of N states each.
 struct MemoryProblem : Batch {
   Index N;
   const float *init, *trans, *lead, *heed, *note, *log_obs;
   float *evidence, *gamma, *held;
+
+  // The most states that a model has ever kept.
+  Index most_awake() const {
+    Index most = 0;
+    for (Index s = 0; s < S; ++s) {
+      Index awake = 0;
+      for (Index n = s * N; n < (s + 1) * N; ++n) awake += note[2 * n + 1] > 0;
+      most = std::max(most, awake);
+    }
+    return most;
+  }
 };
 
 // Where a unit's counts go, in the shapes of the tables; xi counts all moves, [A, N, N].
@@ -52,6 +63,7 @@ class MemoryWorker {
     for (Floats* f : {&any_left_, &any_right_}) f->resize(p_.A * kMemoryBlock * ld_);
     seen_.resize(p_.chunk_rows * T_ * ld_);
     norm_.resize(p_.chunk_rows * T_);
+    noted_.resize(ld_);
     any_filled_.resize(p_.A), own_filled_.resize(p_.A);
   }
 
@@ -63,10 +75,9 @@ class MemoryWorker {
       forward();
     } while (!backward(out));  // again without the rows whose underflow showed only now
     scale_counts(out);
-    for (Index lane = 0; lane < lanes_; ++lane) {
+    for (Index lane = 0; lane < lanes_; ++lane)
       if (failed_[lane]) exact_smooth(lane, out);
-      count_notes(lane, out);
-    }
+    count_notes(out);
   }
 
  private:
@@ -84,8 +95,8 @@ class MemoryWorker {
   // The action that leads on from a step, or negative at a trial's last.
   int32_t departure(Index lane, Index t) const { return t + 1 < T_ ? arrival(lane, t + 1) : kPadding; }
 
-  float* belief(Index lane, Index t) { return belief_ + (lane * T_ + t) * size_; }
-  float* seen(Index lane, Index t) { return seen_ + (lane * T_ + t) * ld_; }
+  float* belief(Index lane, Index t) { return belief_ + (t * lanes_ + lane) * size_; }
+  float* seen(Index lane, Index t) { return seen_ + (t * lanes_ + lane) * ld_; }
   float* pairs(Index lane) { return pairs_ + lane * size_; }
   float* now(Index lane) { return now_ + lane * size_; }
   float* future(Index lane) { return future_ + lane * size_; }
@@ -95,7 +106,7 @@ class MemoryWorker {
   // Calls f(n) for each vector of a column.
   template <class F>
   void each(F f) const {
-    for (Index n = 0; n < vecs_ * kWidth; n += kWidth) f(n);
+    for (Index n = 0, end = vecs_ * kWidth; n < end; n += kWidth) f(n);
   }
   float dot(const float* x, const float* y) const {
     Vec total{};
@@ -135,7 +146,17 @@ class MemoryWorker {
     awake_.clear();
     for (Index n = 0; n < N_; ++n)
       if (!sleeps(n)) awake_.push_back({n, {heed(n)[0], heed(n)[1]}, {note(n)[0], note(n)[1]}, {}, {}});
-    const Index columns = awake_.size();
+    make_room(awake_.size());
+    const float* init = p_.init + model_ * N_;
+    start_.clear();
+    std::copy_n(init, N_, start_ + rest());
+    for (size_t k = 0; k < awake_.size(); ++k) {
+      const Index state = awake_[k].state;
+      *(start_ + (k * ld_ + state)) = init[state], *(start_ + (rest() + state)) = 0;
+    }
+  }
+  void make_room(Index columns) {
+    if (size_ == (columns + 1) * ld_) return;
     size_ = (columns + 1) * ld_;
     belief_.resize(p_.chunk_rows * T_ * size_);
     for (Floats* f : {&pairs_, &now_, &future_}) f->resize(p_.chunk_rows * size_);
@@ -145,12 +166,6 @@ class MemoryWorker {
     own_left_.resize(p_.A * own_room_ * ld_), own_right_.resize(p_.A * own_room_ * 2 * ld_);
     any_groups_.assign(p_.A, group(p_.chunk_rows)), own_groups_.assign(p_.A, group(p_.chunk_rows * columns));
     told_.resize(columns);
-    const float* init = p_.init + model_ * N_;
-    std::copy_n(init, N_, start_ + rest());
-    for (Index k = 0; k < columns; ++k) {
-      const Index state = awake_[k].state;
-      *(start_ + (k * ld_ + state)) = init[state], *(start_ + (rest() + state)) = 0;
-    }
   }
   static Group group(Index rows) { return {std::vector<const float*>(rows), std::vector<float*>(rows)}; }
 
@@ -171,16 +186,16 @@ class MemoryWorker {
   // The memory notes the active state or keeps its own: what sleeps is let go, and an awake state that is noted
   // joins those that remember it.
   void remember(const float* belief, float* pairs) const {
-    each([&](Index n) {
-      Vec noted = load(belief + rest() + n);
-      for (size_t k = 0; k < awake_.size(); ++k) {
-        const Vec share = load(belief + k * ld_ + n);
-        noted += share * awake_[k].choice[0];
-        store(pairs + k * ld_ + n, share * awake_[k].choice[1]);
-      }
-      store(pairs + rest() + n, noted);
-    });
     float* noted = pairs + rest();
+    std::memcpy(noted, belief + rest(), ld_ * sizeof(float));
+    for (size_t k = 0; k < awake_.size(); ++k) {
+      const float *share = belief + k * ld_, note = awake_[k].choice[0], keep = awake_[k].choice[1];
+      float* kept = pairs + k * ld_;
+      each([&](Index n) {
+        store(noted + n, load(noted + n) + load(share + n) * note);
+        store(kept + n, load(share + n) * keep);
+      });
+    }
     for (size_t k = 0; k < awake_.size(); ++k) {
       const Index state = awake_[k].state;
       pairs[k * ld_ + state] += noted[state], noted[state] = 0;
@@ -217,6 +232,7 @@ class MemoryWorker {
       for (Index lane : lanes) {
         const int32_t how = arrival(lane, t);
         if (how == kPadding) continue;
+        fetch(log_obs(lane, std::min(t + 1, T_ - 1)), N_);
         if (how >= 0) heed_memory(how, pairs(lane), now(lane));
         const float shift = observe(how >= 0 ? now(lane) : start_ + 0, lane, t), norm = norm_[lane * T_ + t];
         if (!(norm >= kOverlapFloor)) failed_[lane] = true;
@@ -242,10 +258,11 @@ class MemoryWorker {
     float *density = seen(lane, t), *to = belief(lane, t);
     const float shift = relative(log_obs(lane, t), density, N_);
     if (shift < kImpossible) std::fill_n(density, N_, 1.0f);
+    const Index size = size_, ld = ld_;
     Vec total{};
     each([&](Index n) {
       const Vec here = load(density + n);
-      for (Index at = n; at < size_; at += ld_) {
+      for (Index at = n; at < size; at += ld) {
         const Vec joint = load(now + at) * here;
         total += joint;
         store(to + at, joint);
@@ -256,8 +273,8 @@ class MemoryWorker {
     return shift;
   }
   void scale(float* columns, float by) const {
-    for (Index at = 0; at < size_; at += ld_)
-      each([&](Index n) { store(columns + at + n, load(columns + at + n) * by); });
+    for (float* end = columns + size_; columns < end; columns += ld_)
+      each([&](Index n) { store(columns + n, load(columns + n) * by); });
   }
 
   bool backward(const MemoryCounts& out) {
@@ -283,17 +300,25 @@ class MemoryWorker {
       std::fill_n(gamma(lane, t), N_, 0.0f);
       return true;
     }
+    fetch_to_write(gamma(lane, std::max<Index>(t - 1, 0)), N_);
+    fetch_to_write(held(lane, std::max<Index>(t - 1, 0)), N_);
     float overlap = 1;
     if (next >= 0) remember(belief(lane, t), pairs(lane)), overlap = look_ahead(next, lane, t);
     else std::fill_n(now(lane), size_, 1.0f);
     if (!(overlap * norm_[lane * T_ + t] >= kOverlapFloor)) return false;
     if (next >= 0) count(next, lane, t, 1 / overlap);
     combine(lane, t, 1 / overlap);
-    for (Index n = 0; n < N_ && how == kStart; ++n) {
-      held(lane, t)[n] += belief(lane, t)[rest() + n] * now(lane)[rest() + n] / overlap;
+    if (how == kStart) begin(lane, t, 1 / overlap, out);
+    return true;
+  }
+
+  // A trial's first state is remembered.
+  void begin(Index lane, Index t, float share, const MemoryCounts& out) {
+    const float *past = belief(lane, t) + rest(), *beta = now(lane) + rest();
+    for (Index n = 0; n < N_; ++n) {
+      held(lane, t)[n] += past[n] * beta[n] * share;
       out.initial[n] += gamma(lane, t)[n];
     }
-    return true;
   }
 
   // What an awake state's choices came to at a step.
@@ -313,7 +338,7 @@ class MemoryWorker {
     }
     float overlap = dot(past + rest(), same);
     for (size_t k = 0; k < awake_.size(); ++k, past += ld_, pair += ld_, beta += ld_) {
-      const Awake& node = awake_[k];
+      const Awake node = awake_[k];  // a local copy, which stores cannot touch
       const float told = told_[k].heeded[1];
       Vec all{}, own{}, noted{}, kept{};
       each([&](Index n) {
@@ -336,13 +361,13 @@ class MemoryWorker {
     const float *pair = pairs(lane), *arriving = future(lane), *same = now(lane) + rest();
     for (size_t k = 0; k < awake_.size(); ++k, pair += ld_, arriving += ld_) {
       const Index slot = a * own_room_ + own_filled_[a]++;
-      float *left = own_left_ + slot * ld_, *right = own_right_ + slot * 2 * ld_;
+      float *left = own_left_ + slot * ld_, *right = own_right_ + slot * 2 * ld_, *right_too = right + ld_;
       float* sum = lead_counts_ + (a * awake_.size() + k) * ld_;
       const float *told = led(a, k), by_chain = awake_[k].by[0], all = told_[k].all * share;
       each([&](Index n) {
         const Vec came = load(arriving + n), by_memory = came * load(told + n);
         store(left + n, load(pair + n) * share);
-        store(right + n, came * by_chain), store(right + ld_ + n, by_memory);
+        store(right + n, came * by_chain), store(right_too + n, by_memory);
         store(sum + n, load(sum + n) + by_memory * all);
       });
       for (int i = 0; i < 2; ++i) {
@@ -351,10 +376,10 @@ class MemoryWorker {
       }
     }
     const Index slot = (a * kMemoryBlock + any_filled_[a]++) * ld_;
-    float* remembered = held(lane, t + 1);
+    float *left = any_left_ + slot, *right = any_right_ + slot, *remembered = held(lane, t + 1);
     sweep(N_, [&](Index n, Index size) {
       const Vec noted = load(pair + n) * share;
-      store(any_left_ + slot + n, noted), store(any_right_ + slot + n, load(arriving + n));
+      store(left + n, noted), store(right + n, load(arriving + n));
       store_first(remembered + n, size, load_first(remembered + n, size, 0) + noted * load(same + n));
     });
     if (any_filled_[a] == kMemoryBlock) count_any(a);
@@ -364,17 +389,18 @@ class MemoryWorker {
   // gamma, and who of the awake is remembered; future ∝ density * beta.
   void combine(Index lane, Index t, float share) {
     const float *past = belief(lane, t), *beta = now(lane), *density = seen(lane, t);
-    float* to = future(lane);
+    float *to = future(lane), *both_of = gamma(lane, t);
+    const Index size = size_, ld = ld_;
     Vec total{};
     sweep(N_, [&](Index n, Index count) {
       const Vec here = load(density + n);
       Vec both{};
-      for (Index at = n; at < size_; at += ld_) {
+      for (Index at = n; at < size; at += ld) {
         const Vec later = load(beta + at), onward = later * here;
         both += load(past + at) * later, total += onward;
         store(to + at, onward);
       }
-      store_first(gamma(lane, t) + n, count, both * share);
+      store_first(both_of + n, count, both * share);
     });
     scale(to, 1 / sum(total));
     for (size_t k = 0; k < awake_.size(); ++k)
@@ -411,24 +437,35 @@ class MemoryWorker {
     }
   }
   void scale_row(Index a, Index state, Index i, const MemoryCounts& out) {
-    const float *own = own_counts_ + i * 2 * ld_, *any = any_counts_ + i * ld_, *moves = trans(a) + state * N_;
-    double heeded[2] = {};
-    for (Index j = 0; j < N_; ++j) {
-      const float by_chain = heed(state)[0] * moves[j] * any[j];
-      const float by_memory = heed(state)[1] * lead(a, state)[j] * any[j];
-      const float chain = moves[j] * own[j] + by_chain;
-      out.chain[i * N_ + j] = chain, out.lead[i * N_ + j] = by_memory;
-      out.xi[i * N_ + j] = chain + own[ld_ + j] + by_memory;
+    const float *own = own_counts_ + i * 2 * ld_, *led = own + ld_, *any = any_counts_ + i * ld_;
+    const float *moves = own_ + i * ld_, *told = lead(a, state), by[] = {heed(state)[0], heed(state)[1]};
+    float *chain = out.chain + i * N_, *lead = out.lead + i * N_, *xi = out.xi + i * N_;
+    Vec heeded[2] = {};
+    sweep(N_, [&](Index n, Index size) {
+      const Vec step = load(moves + n), count = load(any + n);
+      const Vec by_chain = step * count * by[0], by_memory = load_first(told + n, size, 0) * count * by[1];
+      const Vec all = step * load(own + n) + by_chain;
       heeded[0] += by_chain, heeded[1] += by_memory;
-    }
-    for (int c = 0; c < 2; ++c) out.heed[2 * state + c] += heeded[c];
+      store_first(chain + n, size, all), store_first(lead + n, size, by_memory);
+      store_first(xi + n, size, all + load(led + n) + by_memory);
+    });
+    for (int c = 0; c < 2; ++c) out.heed[2 * state + c] += sum(heeded[c]);
   }
 
   // What sleeps and is remembered is let go at the next step.
-  void count_notes(Index lane, const MemoryCounts& out) const {
-    for (Index t = 0; t < T_; ++t)
-      for (Index n = 0; n < N_ && departure(lane, t) >= 0; ++n)
-        if (sleeps(n)) out.note[2 * n] += held(lane, t)[n];
+  void count_notes(const MemoryCounts& out) {
+    noted_.clear();
+    for (Index lane = 0; lane < lanes_; ++lane)
+      for (Index t = 0; t < T_; ++t) {
+        if (departure(lane, t) < 0) continue;
+        const float* remembered = held(lane, t);
+        float* noted = noted_ + 0;
+        sweep(N_, [&](Index n, Index size) {
+          store(noted + n, load(noted + n) + load_first(remembered + n, size, 0));
+        });
+      }
+    for (Index n = 0; n < N_; ++n)
+      if (sleeps(n)) out.note[2 * n] = *(noted_ + n);
   }
 
   // In memory_exact.h.
@@ -444,8 +481,9 @@ class MemoryWorker {
   Floats own_, own_back_, any_, any_back_;
   Floats led_, lead_counts_;               // moves by the memory, [A, K, ld]
   Floats start_;                           // columns of pairs: [K + 1, ld]
-  Floats belief_, pairs_, now_, future_;   // [rows, T, K + 1, ld]; [rows, K + 1, ld]
-  Floats seen_;                            // densities, [rows, T, ld]
+  Floats belief_, pairs_, now_, future_;   // [T, rows, K + 1, ld]; [rows, K + 1, ld]
+  Floats seen_;                            // densities, [T, rows, ld]
+  Floats noted_;                           // [ld]
   Floats any_left_, any_right_, any_counts_, own_left_, own_right_, own_counts_;
   std::vector<float> norm_;
   std::vector<Group> any_groups_, own_groups_;
