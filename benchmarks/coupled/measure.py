@@ -90,12 +90,13 @@ def milliseconds(calls: dict[str, Callable[[], Any]], rounds: int = 7) -> dict[s
 
 
 def cost_rows(models: int = 4, trials: int = 8, steps: int = 64) -> list[dict[str, Any]]:
-    """Time every plan of exact inference, and the sweep over marginals, against sizes."""
+    """Time every plan of exact inference, and of the sweep over marginals, against sizes."""
     found = []
     for sizes in SIZES:
         rng = np.random.default_rng(3)
         given = (chains(rng, models, *sizes, 1.0), *tapes(rng, models, trials, steps, sizes))
         calls = {p: partial(coupled_posterior, *given, plan=p) for p in ("scan", "native")}
+        calls["marginals_scan"] = partial(marginal_posterior, *given, plan="scan")
         calls["marginals"] = partial(marginal_posterior, *given)
         found.append({"states": list(sizes)} | milliseconds(calls, 15))
     return found

@@ -137,6 +137,7 @@ class MarginalWorker {
     const Index N = p_.N[c];
     const float *row = log_obs(c, lane, t), *now = now_ + lane * row_ld_ + first(c);
     float *seen = density(lane, t) + first(c), *to = belief(lane, t) + first(c);
+    fetch(log_obs(c, lane, std::min(t + 1, T_ - 1)), N);
     auto within_reach = [&](Index n, Index count) {
       return load_first(now + n, count, 0) > Vec{} ? load_first(row + n, count, kNeg) : splat(kNeg);
     };
@@ -308,6 +309,7 @@ class MarginalWorker {
     const Index N = p_.N[c];
     const float *here = belief(lane, t) + first(c), *seen = density(lane, t) + first(c), *beta = beta_ + first(c);
     float *future = future_ + lane * row_ld_ + first(c), *out = gamma(c, lane, t);
+    fetch_to_write(gamma(c, lane, std::max<Index>(t - 1, 0)), N);
     Vec mass{};
     sweep(N, [&](Index n, Index count) {
       const Vec weight = load_first(beta + n, count, 0), joint = load_first(here + n, count, 0) * weight;
