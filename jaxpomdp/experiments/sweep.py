@@ -7,12 +7,15 @@ never follows from the number of workers: a rerun with other workers gives the s
 from __future__ import annotations
 
 import importlib
+import math
 import multiprocessing
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+import jax
 
 from jaxpomdp.experiments.config import RunConfig, describe, digest
 from jaxpomdp.experiments.runner import Build, build, run
@@ -85,17 +88,38 @@ def run_jobs(
         _run_on_ray(distinct, make)
     elif workers == 1 or len(distinct) == 1:
         for job in distinct:
-            run(job.config, job.path, progress=progress, make=make)
+            _run(job, progress, make)
     else:
         kind = "none" if progress == "none" else "lines"
         _run_in_processes(distinct, min(workers, len(distinct)), make, kind)
+
+
+def _run(job: Job, progress: str, make: Build) -> None:
+    """Do a job in a process that may have done many."""
+    if memory_maps_left() < FEW_MAPS:
+        jax.clear_caches()
+    run(job.config, job.path, progress=progress, make=make)
+
+
+FEW_MAPS = 30_000
+"""Each compiled function takes a few of the memory maps that a process may have, most often 65,530."""
+
+
+def memory_maps_left(process: Path = Path("/proc/self"), system: Path = Path("/proc/sys/vm")) -> float:
+    """Return how many memory maps this process may still open; infinite where the system does not say."""
+    try:
+        most = int((system / "max_map_count").read_text())
+        with (process / "maps").open() as maps:
+            return most - sum(1 for _ in maps)
+    except (OSError, ValueError):
+        return math.inf
 
 
 def _run_in_processes(jobs: Sequence[Job], workers: int, make: Build, progress: str) -> None:
     """Run in fresh processes (forking one that has used JAX may hang); the first error stops the rest."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        futures = [pool.submit(run, job.config, job.path, progress=progress, make=make) for job in jobs]
+        futures = [pool.submit(_run, job, progress, make) for job in jobs]
         try:
             for future in as_completed(futures):
                 future.result()
@@ -111,5 +135,5 @@ def _run_on_ray(jobs: Sequence[Job], make: Build) -> None:
         raise ModuleNotFoundError("backend 'ray' needs Ray: pip install 'jaxpomdp[cluster]'") from None
     if not ray.is_initialized():
         ray.init(include_dashboard=False)
-    remote = ray.remote(num_cpus=1)(run)
-    ray.get([remote.remote(job.config, job.path.resolve(), progress="lines", make=make) for job in jobs])
+    remote = ray.remote(num_cpus=1)(_run)
+    ray.get([remote.remote(Job(job.config, job.path.resolve()), "lines", make) for job in jobs])

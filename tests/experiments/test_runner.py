@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
-from jaxpomdp.experiments import record, runner
+from jaxpomdp.experiments import record, runner, sweep
 from jaxpomdp.experiments.arrays import load_arrays
 from jaxpomdp.experiments.config import RunConfig, seed_range
 from jaxpomdp.experiments.results import Criterion, load_run, merge_runs, outcome, score
-from jaxpomdp.experiments.sweep import in_chunks, plan, run_jobs
+from jaxpomdp.experiments.sweep import Job, in_chunks, memory_maps_left, plan, run_jobs
 from tests.experiments.fake import FakeAgent, build_fake
 
 CONFIG = RunConfig(
@@ -137,6 +139,24 @@ def test_workers_give_what_one_process_gives(tmp_path, whole):
     jobs = plan([CONFIG, RunConfig(agent="fake", trials=5, final_trials=2)], tmp_path, make=build_fake)
     run_jobs([job for row in jobs for job in row], workers=2, progress="none", make=build_fake)
     same(jobs[0][0].path, whole)
+
+
+def test_a_process_of_many_jobs_forgets_what_it_compiled_before_maps_run_out(tmp_path, monkeypatch):
+    """A reproduction in one process once died of them: LLVM could not allocate memory."""
+    function = jax.jit(lambda x: x + 1)
+    jobs = [Job(RunConfig(seeds=(s,), trials=4), tmp_path / str(s)) for s in (0, 1)]
+    for few, kept in ((0, 1), (sweep.FEW_MAPS, 1), (10**9, 0)):
+        function(1)
+        monkeypatch.setattr(sweep, "FEW_MAPS", few)
+        run_jobs(jobs, progress="none", make=build_fake)
+        assert function._cache_size() == kept
+
+
+def test_memory_maps_are_counted_where_the_system_says(tmp_path):
+    assert memory_maps_left(tmp_path, tmp_path) == math.inf
+    (tmp_path / "maps").write_text("one\ntwo\n")
+    (tmp_path / "max_map_count").write_text("10\n")
+    assert memory_maps_left(tmp_path, tmp_path) == 8
 
 
 def test_directories_tell_configurations_apart(tmp_path):

@@ -336,4 +336,4 @@ def test_errors_name_the_argument() -> None:
     with pytest.raises(ValueError, match=r"capacities must be at least \[3, 3\]"):
         with_capacities(params, (2, 3))
     with pytest.raises(ValueError, match="plan must be one of"):
-        e_step(COUPLED_MIXTURE, stack(params), stack(tapes), EMConfig(plan="native"))
+        e_step(COUPLED_MIXTURE, stack(params), stack(tapes), EMConfig(plan="pairs"))
