@@ -2,7 +2,8 @@
 
     python benchmarks/coupled/measure.py errors cost flat
 
-Each part writes ``benchmarks/results/coupled-NAME.json``. All models are random; seeds are fixed.
+Each part writes ``benchmarks/results/coupled-NAME.json``, and the first two a picture. All models are random;
+seeds are fixed.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxpomdp._types import Chain
@@ -132,7 +134,49 @@ def beside_flat() -> dict[str, Any]:
     return {"milliseconds": taken, "bytes": memory, "coupled_over_flat": ratios}
 
 
+def draw_errors(found: list[dict[str, Any]], path: Path) -> None:
+    """Draw the errors of the sweep over marginals against the strength of the coupling: mean and worst."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
+    strengths = [row["strength"] for row in found]
+    names = {"log_evidence_per_step": "mean of models", "worst": "worst model"}
+    for name, label in names.items():
+        axes[0].plot(strengths, [row[name] for row in found], "o-", label=label)
+    for c in (0, 1):
+        axes[1].plot(
+            strengths, [row[f"total_variation_{c}"] for row in found], "o-", label=f"chain {c}, mean"
+        )
+        axes[1].plot(strengths, [row[f"worst_{c}"] for row in found], "x:", label=f"chain {c}, worst step")
+    axes[0].set(ylabel="log-evidence, nats per step", xlabel="strength of the coupling")
+    axes[1].set(ylabel="marginals, total variation", xlabel="strength of the coupling")
+    _finish(figure, axes, path)
+
+
+def draw_cost(found: list[dict[str, Any]], path: Path) -> None:
+    """Draw the time of each plan against the states of each chain."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True)
+    labels = {"scan": "exact, XLA", "native": "exact, C++"}
+    labels |= {"marginals_scan": "marginals, XLA", "marginals": "marginals, C++"}
+    for axis, own, fixed in ((axes[0], 0, 4), (axes[1], 1, 25)):
+        rows = sorted((r for r in found if r["states"][1 - own] == fixed), key=lambda r: r["states"][own])
+        sizes = [row["states"][own] for row in rows]
+        for name, label in labels.items():
+            axis.loglog(sizes, [row[name] for row in rows], "o-", label=label)
+        axis.set(xlabel=f"states of chain {own}, of {fixed} in the other", xticks=sizes, xticklabels=sizes)
+        axis.minorticks_off()
+    axes[0].set(ylabel="milliseconds")
+    _finish(figure, axes, path)
+
+
+def _finish(figure: Any, axes: Any, path: Path) -> None:
+    for axis in axes:
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=7)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
 PARTS = {"errors": error_rows, "cost": cost_rows, "flat": beside_flat}
+PICTURES = {"errors": draw_errors, "cost": draw_cost}
 
 
 def main() -> None:
@@ -144,6 +188,8 @@ def main() -> None:
     for name in options.parts:
         found = PARTS[name]()
         write_json(options.out / f"coupled-{name}.json", {"versions": versions(), "found": found})
+        if name in PICTURES:
+            PICTURES[name](found, options.out / f"coupled-{name}.png")
         print(name, found)
 
 
