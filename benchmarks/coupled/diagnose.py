@@ -6,7 +6,7 @@
   window of trials that learning sees: the mutual information ``I(o'; r | o, a)`` that strand 1 has about
   where strand 0 goes next, and what the observations are worth under the coupled model and under the chain
   that acts, in nats per step.
-- *Exploration hides circles.* The share of trials that succeed while the agent explores, and greedily; and
+- *Exploration hides circles.* The share of trials that succeed in training, with exploration, and greedily; and
   whether the gate holds the model, which then learns no more.
 
 The controls: no return modelled (``theta = 0``); couplings frozen at even rows, where the strands are apart;
@@ -156,7 +156,7 @@ def followed(config: AgentConfig, seeds: list[int], trials: int, every: int) -> 
         won.append(phase["success"])
         if done % every == 0:
             latest = np.concatenate(won, axis=1)[:, -every:].mean(axis=1)
-            found = measured(agent, state) | {"exploring": latest, "states": phase["states"]}
+            found = measured(agent, state) | {"training": latest, "states": phase["states"]}
             rows.append(
                 {"trials": done} | {k: np.round(np.asarray(v, float), 4).tolist() for k, v in found.items()}
             )
@@ -171,11 +171,11 @@ def summary(rows: list[dict[str, Any]]) -> str:
 
 
 def draw(found: dict[str, list[dict[str, Any]]], path: Path) -> None:
-    """Draw the last checkpoint: success while exploring and greedily, and the two suspects' nats."""
+    """Draw the last checkpoint: success in training and greedily, and the two suspects' nats."""
     last = {name: rows[-1] for name, rows in found.items()}
     places = np.arange(len(last))
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 0.5 * len(last) + 1.5), sharey=True)
-    for shift, (name, color) in zip((-0.2, 0.2), {"exploring": "C0", "greedy": "C3"}.items(), strict=True):
+    for shift, (name, color) in zip((-0.2, 0.2), {"training": "C0", "greedy": "C3"}.items(), strict=True):
         shares = [100 * np.asarray(row[name]) for row in last.values()]
         left.barh(places + shift, [x.mean() for x in shares], 0.4, color=color, alpha=0.6, label=name)
         for place, seeds in zip(places + shift, shares, strict=True):

@@ -129,7 +129,8 @@ class Agent:
         actor, parts = self._act(state)
         rows = joined([summarise(new, self.world) for new in parts])
         clock.lap("acting")
-        state = self._judge(state._replace(actor=actor), rows["discounted"])
+        state = self._noted(state._replace(actor=actor), rows["discounted"])
+        state = self._judge(state, rows["discounted"].shape[1])
         evidence = np.zeros(len(state.recent))
         if self.config.learner:
             for new in parts:
@@ -160,16 +161,19 @@ class Agent:
             "epsilon": np.broadcast_to(np.asarray(level), evidence.shape),
         } | seconds
 
-    def _judge(self, state: AgentState, discounted: np.ndarray) -> AgentState:
-        """Note how the latest trials went, and keep a copy of the policy that did best on average."""
+    def _noted(self, state: AgentState, discounted: np.ndarray) -> AgentState:
+        """Note how the latest trials went."""
+        width = state.recent.shape[1]
+        return state._replace(recent=np.concatenate([state.recent, discounted], axis=1)[:, -width:])
+
+    def _judge(self, state: AgentState, trials: int) -> AgentState:
+        """Keep a copy of the policy that did best on average, ``trials`` after it was judged last."""
         settings = self.config.learner
         if not (settings and settings.keep_best):
             return state
-        width, trials = state.recent.shape[1], discounted.shape[1]
-        recent = np.concatenate([state.recent, discounted], axis=1)[:, -width:]
         now = (state.params, state.actor.q)
-        best = keeping.judged(state.best, recent, *now, trials, settings.probation)
-        return state._replace(recent=recent, best=best)
+        best = keeping.judged(state.best, state.recent, *now, trials, settings.probation)
+        return state._replace(best=best)
 
     def _learn(self, state: AgentState, clock: Clock) -> tuple[AgentState, np.ndarray]:
         settings = self.config.learner
@@ -215,7 +219,7 @@ class Agent:
             actor=replace(state.actor, q=q),
             rest=np.where(stale[:, None], 0, state.rest),
             recent=np.where(stale[:, None], np.nan, state.recent),
-            best=best._replace(age=np.where(stale, 0, age)),
+            best=keeping.waiting_anew(best, stale, params, q)._replace(age=np.where(stale, 0, age)),
         )
 
     def _held(self, state: AgentState) -> np.ndarray:

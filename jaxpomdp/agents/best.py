@@ -87,6 +87,12 @@ def judged(best: Best, recent: np.ndarray, params: Any, q: Array, trials: int, p
     return Best(kept, values, score, error, age, waiting, np.where(ripe, 0, served))
 
 
+def waiting_anew(best: Best, mask: np.ndarray, params: Any, q: Array) -> Best:
+    """Where ``mask[S]`` an agent begins again: let its new policy wait, not one that was given up."""
+    waiting = best.waiting and select(mask, (params, q), best.waiting)
+    return best._replace(waiting=waiting, served=np.where(mask, 0, best.served))
+
+
 def given_up(best: Best, recent: np.ndarray, margin: float) -> np.ndarray:
     """Say which agents end with the best policy, not with the one of now, which never served a probation."""
     return np.isfinite(best.score) if best.waiting else clearly_worse(best, recent, margin)

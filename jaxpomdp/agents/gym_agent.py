@@ -82,7 +82,8 @@ class _Learner(Agent):
         if was_blind and complete:
             state = self._informed(state)
         elif not was_blind:
-            state = self._judge(state, rows["discounted"])
+            state = self._noted(state, rows["discounted"])
+            state = self._judge(state, self.config.learner.trials_per_phase) if complete else state
         if complete:
             state, evidence = self._learn(state, clock)
         return state, rows | self._phase_rows(state, evidence, clock)
@@ -163,7 +164,7 @@ class GymAgent:
             trials: at least 1.
             seed: begin from nothing with seeds ``seed, seed + 1, ...`` (agent and environment); ``None`` goes
                 on where the last training stopped, or begins with seed 0.
-            progress: called after each phase with its rows (as of ``Agent.run``).
+            progress: called after each phase, and before its rehearsals, with rows (as of ``Agent.run``).
 
         Returns:
             ``steps``, ``reward``, ``discounted`` and ``success`` of every trial, each ``[S, trials]``.
@@ -198,7 +199,7 @@ class GymAgent:
         return agents.summarise(new, self._learner.world)
 
     def finish(self) -> None:
-        """Go back to the best policy so far where it was better on average (``learner.keep_best``)."""
+        """Go back to the best policy so far where it is to be preferred (``learner.keep_best``)."""
         self.state = self._learner.finish(self._trained())
 
     def begin_trial(self) -> None:

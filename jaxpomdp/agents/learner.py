@@ -53,8 +53,8 @@ class LearnerConfig:
     trials_per_phase: int = 50
     """Trials between offline phases."""
     rehearsals: int = 0
-    """So many of them, the last, are as at the end: greedy, and the values stay as they are. They find out a
-    policy that goes round in circles unless exploration, or learning on the way, frees it."""
+    """So many of them, the last, are as at the end: greedy, and nothing is learned on the way (but replay
+    learns from them). They find out a policy that goes round in circles unless exploration frees it."""
     em_iterations: int = 3
     """Baum-Welch iterations in a phase, before any split."""
     split_iterations: int = 1
@@ -95,6 +95,8 @@ class LearnerConfig:
             "em_iterations": 0,
             "replay_passes": 0,
             "bins": 4,
+            "keep_best": 0,
+            "probation": 0,
         }
         for name, bound in least.items():
             if getattr(self, name) < bound:
@@ -106,7 +108,7 @@ class LearnerConfig:
             )
         if self.initial not in ("observation", "random"):
             raise ValueError(f"initial must be 'observation' or 'random', got {self.initial!r}")
-        if not 0 <= self.probation <= self.keep_best:
+        if self.probation > self.keep_best:
             raise ValueError(
                 f"probation must be from 0 to keep_best = {self.keep_best}, got {self.probation}"
             )

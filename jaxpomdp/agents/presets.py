@@ -135,7 +135,8 @@ HUDHMM_TMAZE = AgentConfig(
         tests=TreeSplitConfig(stay=0.9),
     ),
 )
-"""The hierarchical agent in the T-maze (thesis 6.4.1): one level at first, leaves also split as flat ones."""
+"""The hierarchical agent in the T-maze (thesis 6.4.1): one level at first, leaves also split as flat ones; it
+rehearses, and keeps no policy as its best before a probation."""
 
 
 def with_memory(base: AgentConfig) -> AgentConfig:

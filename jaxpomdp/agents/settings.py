@@ -11,20 +11,24 @@ from typing import Any
 def with_settings(config: Any, settings: Mapping[str, Any]) -> Any:
     """Return a (nested) dataclass with settings changed by name: ``theta`` or ``learner.split.stay``.
 
-    A bare name must belong to one field only, or to the outermost field of that name.
+    A bare name must belong to one field only, or to the outermost field of that name. The order of names
+    means nothing: parts given whole come first, and each part is made once, with all that changes in it.
 
     Raises:
-        ValueError: no such setting, or a name that more than one part has.
+        ValueError: no such setting, a name that more than one part has, or what a part says of its fields.
     """
-    for name, value in settings.items():
-        config = _with(config, _path(config, name), value)
+    whole = {name: value for name, value in settings.items() if dataclasses.is_dataclass(value)}
+    for some in (whole, {name: value for name, value in settings.items() if name not in whole}):
+        config = _changed(config, {_path(config, name): value for name, value in some.items()})
     return config
 
 
-def _with(config: Any, path: tuple[str, ...], value: Any) -> Any:
-    head, *rest = path
-    inner = _with(getattr(config, head), tuple(rest), value) if rest else value
-    return replace(config, **{head: inner})
+def _changed(config: Any, changes: Mapping[tuple[str, ...], Any]) -> Any:
+    new = {path[0]: value for path, value in changes.items() if len(path) == 1}
+    for head in {path[0] for path in changes if len(path) > 1}:
+        inner = {path[1:]: value for path, value in changes.items() if path[0] == head and len(path) > 1}
+        new[head] = _changed(new.get(head, getattr(config, head)), inner)
+    return replace(config, **new)
 
 
 def _path(config: Any, name: str) -> tuple[str, ...]:

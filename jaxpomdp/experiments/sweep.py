@@ -70,6 +70,8 @@ def run_jobs(
 ) -> None:
     """Do every job that is not done: here if ``workers`` is 1, else one job per process, or on a Ray cluster.
 
+    Before a job JAX forgets what this process compiled if memory maps run out.
+
     Args:
         jobs: what to do; a directory that several jobs name is done once.
         workers: jobs at a time; each process compiles for itself.

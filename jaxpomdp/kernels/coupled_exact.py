@@ -24,6 +24,7 @@ from jaxpomdp.kernels.coupled import (
     where_valid,
 )
 from jaxpomdp.kernels.filtering import Filtered, linked_steps, trial_starts
+from jaxpomdp.kernels.smoothing import heeded_rows
 from jaxpomdp.numerics import NEG, log_sum_exp
 
 
@@ -119,11 +120,9 @@ def smooth_joint_exact(
 
 
 def _heeded(predicted: Array, rows: Array) -> Array:
-    """Shift rows by the best density within reach; ``NEG`` out of reach, zeros at an impossible step."""
-    reachable = predicted > NEG / 2
-    best = jnp.max(jnp.where(reachable, rows, NEG), axis=(1, 2), keepdims=True)
-    heeded = jnp.where(best > NEG / 2, jnp.maximum(rows - best, NEG), 0)
-    return jnp.where(reachable, heeded, NEG)
+    """Shift rows ``[T, N_1, N_2]`` as ``heeded_rows`` does those of one chain."""
+    flat = (x.reshape(x.shape[0], -1) for x in (predicted, rows))
+    return heeded_rows(*flat).reshape(rows.shape)
 
 
 def smooth_both(

@@ -63,7 +63,7 @@ PLANS = ("auto", *_EXACT)
 """Names of the evaluation plans, of exact inference and of the sweep over marginals."""
 
 
-def choose_plan(plan: str, chains: CoupledChain) -> str:
+def choose_plan(plan: str, chains: CoupledChain, log_obs: Rows = ()) -> str:
     """Resolve ``auto``, and check that a named plan can run here.
 
     Raises:
@@ -71,7 +71,7 @@ def choose_plan(plan: str, chains: CoupledChain) -> str:
     """
     if plan not in PLANS:
         raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    number, dtype = len(chains.log_init), chains.log_init[0].dtype
+    number, dtype = len(chains.log_init), jnp.result_type(*chains.log_init, *chains.log_trans, *log_obs)
     if plan == "native" and number != 2:
         raise ValueError(f"plan 'native' needs two chains, got {number}")
     fits = number == 2 and dtype == jnp.float32 and native.available()
@@ -111,9 +111,11 @@ def coupled_posterior(
     Raises:
         ValueError: ``plan`` is not known or cannot run here, there are not two chains, or the shapes do not
             fit.
+
+    Source: thesis section 3.4; Brand (1997), Zhong and Ghosh (2001) for the couplings.
     """
     check_two(chains)
-    chosen = choose_plan(plan, chains)
+    chosen = choose_plan(plan, chains, log_obs)
     _check_shapes(chains, log_obs, actions, start, valid)
     return _exact(chains, log_obs, actions, start, valid, plan=chosen)
 
@@ -131,10 +133,15 @@ def marginal_posterior(
         valid: bool ``[S, B, T]``.
         plan: one of ``PLANS``; ``native`` takes two chains.
 
+    Returns:
+        As ``coupled_posterior``, of as many chains as there are; the log-evidence is approximate too.
+
     Raises:
         ValueError: ``plan`` is not known or cannot run here, or the shapes do not fit.
+
+    Source: Boyen and Koller (1998, 1999).
     """
-    chosen = choose_plan(plan, chains)
+    chosen = choose_plan(plan, chains, log_obs)
     _check_shapes(chains, log_obs, actions, start, valid)
     return _marginal(chains, log_obs, actions, start, valid, plan=chosen)
 
@@ -146,6 +153,9 @@ def _check_shapes(chains: CoupledChain, log_obs: Rows, actions: Array, start: Ar
             raise ValueError(f"{name} must have shape {actions.shape} as actions, got {array.shape}")
     sizes = tuple(x.shape[-1] for x in chains.log_init)
     for c, (row, table) in enumerate(zip(log_obs, chains.log_trans, strict=True)):
+        if chains.log_init[c].shape[:-1] != actions.shape[:1]:
+            got = chains.log_init[c].shape
+            raise ValueError(f"log_init[{c}] must have shape {(actions.shape[0], sizes[c])}, got {got}")
         if row.shape != (*actions.shape, sizes[c]):
             raise ValueError(f"log_obs[{c}] must have shape {(*actions.shape, sizes[c])}, got {row.shape}")
         if table.shape[2:] != (*sizes, sizes[c]) or table.shape[0] != actions.shape[0]:

@@ -79,7 +79,7 @@ PLANS = ("auto", *_PLANS)
 """Names of the evaluation plans."""
 
 
-def choose_plan(plan: str, dtype: jnp.dtype) -> str:
+def choose_plan(plan: str, dtype: Any) -> str:
     """Resolve ``auto``, and check that a named plan can run here.
 
     Raises:
@@ -117,9 +117,12 @@ def memory_posterior(
         ``log_evidence[S, B]``, ``gamma`` and ``held`` ``[S, B, T, N]``; the rest are sums over the tapes.
 
     Raises:
-        ValueError: ``plan`` is not known or cannot run here, or the shapes do not fit.
+        ValueError: ``plan`` is not known or cannot run here, or the shapes of ``log_init``, ``log_obs``,
+            ``actions`` and flags do not fit.
+
+    Source: thesis section 6.3.5.
     """
-    chosen = choose_plan(plan, log_obs.dtype)
+    chosen = choose_plan(plan, jnp.result_type(log_obs, *chains))
     for name, array in {"actions": actions, "start": start, "valid": valid}.items():
         if array.shape != log_obs.shape[:3]:
             raise ValueError(f"{name} must have shape {log_obs.shape[:3]} as log_obs, got {array.shape}")

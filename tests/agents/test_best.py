@@ -8,7 +8,7 @@ import pytest
 
 from jaxpomdp.agents import best as keeping
 from jaxpomdp.agents.agent import Agent
-from jaxpomdp.agents.presets import TMAZE
+from jaxpomdp.agents.presets import HUDHMM_TMAZE, TMAZE
 from jaxpomdp.agents.settings import with_settings
 from jaxpomdp.envs.tmaze import tmaze
 
@@ -91,6 +91,27 @@ def test_an_agent_with_a_probation_ends_with_a_policy_that_served_it():
     assert not keeping.given_up(
         keeping.none_yet(params_of(0), q_of(0))._replace(score=waits.score), good, 1.0
     )[0]
+
+
+def test_an_agent_that_begins_again_lets_no_policy_wait_that_it_gave_up():
+    waits = keeping.none_yet(params_of(1), q_of(1), probation=4)._replace(served=np.array([2]))
+    anew = keeping.waiting_anew(waits, np.array([True]), params_of(2), q_of(2))
+    np.testing.assert_array_equal(anew.waiting[1], q_of(2))
+    assert anew.served == [0]
+    same = keeping.waiting_anew(waits, np.array([False]), params_of(2), q_of(2))
+    np.testing.assert_array_equal(same.waiting[1], q_of(1))
+    assert same.served == [2]
+
+
+def test_settings_may_come_in_any_order():
+    for settings in ({"keep_best": 0, "probation": 0}, {"probation": 70, "keep_best": 80}):
+        learner = with_settings(HUDHMM_TMAZE, settings).learner
+        assert (learner.keep_best, learner.probation) == (settings["keep_best"], settings["probation"])
+    whole = {"theta": 0.7, "learner": TMAZE.learner, "learner.split.stay": 0.5}
+    learner = with_settings(HUDHMM_TMAZE, whole).learner
+    assert (learner.probation, learner.theta, learner.split.stay) == (0, 0.7, 0.5)
+    with pytest.raises(ValueError, match="keep_best must be at least 0, got -1"):
+        with_settings(TMAZE, {"keep_best": -1})
 
 
 def test_a_probation_longer_than_the_average_is_refused():

@@ -179,6 +179,7 @@ def test_rehearsals_in_gymnasium_teach_no_values_and_end_the_phase():
     agent.train(env, exploring, seed=0)
     before = agent.state
     agent.train(env, 1)
+    assert np.isinf(agent.state.best.score).all(), "judged before the phase was over"
     np.testing.assert_array_equal(agent.state.actor.q, before.actor.q)
     rows = agent.train(env, 1 + exploring + 2, progress=lambda row: phases.append(row["steps"].shape[1]))
     assert phases == [1, exploring, 2]

@@ -145,9 +145,9 @@ def test_a_process_of_many_jobs_forgets_what_it_compiled_before_maps_run_out(tmp
     """A reproduction in one process once died of them: LLVM could not allocate memory."""
     function = jax.jit(lambda x: x + 1)
     jobs = [Job(RunConfig(seeds=(s,), trials=4), tmp_path / str(s)) for s in (0, 1)]
-    for few, kept in ((0, 1), (sweep.FEW_MAPS, 1), (10**9, 0)):
+    for left, kept in ((math.inf, 1), (sweep.FEW_MAPS, 1), (sweep.FEW_MAPS - 1, 0)):
         function(1)
-        monkeypatch.setattr(sweep, "FEW_MAPS", few)
+        monkeypatch.setattr(sweep, "memory_maps_left", lambda left=left: left)
         run_jobs(jobs, progress="none", make=build_fake)
         assert function._cache_size() == kept
 

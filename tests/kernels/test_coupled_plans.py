@@ -276,6 +276,28 @@ def test_auto_prefers_native_and_never_needs_it(monkeypatch: pytest.MonkeyPatch)
     assert choose_plan("auto", single) == "scan"
 
 
+def test_auto_takes_no_mixed_numbers_to_native(monkeypatch: pytest.MonkeyPatch) -> None:
+    single = np.zeros((1, 40), np.float32)
+    monkeypatch.setattr(native, "available", lambda: True)
+    chains = CoupledChain((single, single), (single, single))
+    assert choose_plan("auto", chains, (single, single)) == "native"
+    assert choose_plan("auto", chains, (single, single.astype(float))) == "scan"
+
+
+@needs_native
+def test_an_impossible_tape_changes_no_bit_of_those_after_it() -> None:
+    """What lies behind the last pair in the belief's vectors once turned NaN there, for all later tapes."""
+    chains, rows, *rest = stack_coupled(batch(1, 6, sizes=(3, 5)), np.float32)
+    dead = chains._replace(log_init=(chains.log_init[0].at[:, 0].set(NEG), chains.log_init[1]))
+    only_dead = rows[0].at[:, 0].set(NEG).at[:, 0, :, 0].set(0)
+    spoilt = coupled_posterior(dead, (only_dead, rows[1]), *rest, plan="native")
+    clean = coupled_posterior(dead, rows, *rest, plan="native")
+    for one, other in zip(
+        (*spoilt.gamma, spoilt.log_evidence), (*clean.gamma, clean.log_evidence), strict=True
+    ):
+        np.testing.assert_array_equal(one[:, 1:], other[:, 1:])
+
+
 def test_bad_arguments_are_named() -> None:
     (init, trans), rows, actions, *flags = stack_coupled(batch(2, 3), np.float32)
     with pytest.raises(ValueError, match=r"plan must be one of .*got 'pairs'"):

@@ -165,6 +165,7 @@ class CoupledWorker {
         store_first(belief + i * two_ + j, count, joint);
       });
     norm_[t] = sum(total);
+    if (!(norm_[t] >= kOverlapFloor)) return shift;  // not trusted; by zero, what lies behind the pairs turns NaN
     const Vec scale = splat(1 / norm_[t]);
     for (Index p = 0; p < pair_vecs_ * kWidth; p += kWidth) store(belief + p, load(belief + p) * scale);
     return shift;

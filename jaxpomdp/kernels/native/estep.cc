@@ -1,8 +1,8 @@
 // Expected counts, filtering, acting and SARSA replay on the CPU, behind JAX's foreign function interface.
 //
-// Rows of one model run in step: at each time the rows that took the same action share one small matrix
-// product, and the expected transitions are one product per action over blocks of steps. Probabilities are
-// renormalised at every step; a row where underflow mattered is done again in logarithms and double precision.
+// Most kernels let rows of one model run in step: at each time the rows that took the same action share one small
+// matrix product, and the expected transitions are one product per action over blocks of steps. Probabilities are
+// renormalised at every step; what underflow spoilt, a row or a step of it, is done again in double precision.
 // The semantics are those of kernels/smoothing.py, kernels/filtering.py, kernels/coupled_exact.py,
 // kernels/coupled_marginals.py, kernels/memory.py and agents/trial.py, the tests' oracles.
 
@@ -140,7 +140,7 @@ ffi::Error coupled(ffi::RemainingArgs args, ffi::RemainingRets rets, ffi::Dictio
     p.gamma[c] = call.result(1 + c);
   }
   p.evidence = call.result(0);
-  p.S = call.in(0).element_count() / p.N[0];
+  p.S = p.N[0] == 0 ? 0 : call.in(0).element_count() / p.N[0];
   const Index pairs = p.N[0] * p.N[1], cells = p.A * pairs;
   p.plan_chunks(Worker::kChunk, cells * (p.N[0] + p.N[1]));
   Sums xi[] = {{p, call.result(3), cells * p.N[0]}, {p, call.result(4), cells * p.N[1]}};
