@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxpomdp._types import Array
 from jaxpomdp.kernels import native
@@ -71,12 +72,13 @@ def choose_plan(plan: str, chains: CoupledChain, log_obs: Rows = ()) -> str:
     """
     if plan not in PLANS:
         raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    number, dtype = len(chains.log_init), jnp.result_type(*chains.log_init, *chains.log_trans, *log_obs)
+    number = len(chains.log_init)
+    dtype = np.result_type(*(x.dtype for x in (*chains.log_init, *chains.log_trans, *log_obs)))
     if plan == "native" and number != 2:
         raise ValueError(f"plan 'native' needs two chains, got {number}")
     fits = number == 2 and dtype == jnp.float32 and native.available()
     if plan == "native" and not fits:
-        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
+        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {dtype.name}")
     if plan == "auto":
         return "native" if fits else "scan"
     return plan

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxpomdp._types import Array, Chain
@@ -122,7 +123,7 @@ def memory_posterior(
 
     Source: thesis section 6.3.5.
     """
-    chosen = choose_plan(plan, jnp.result_type(log_obs, *chains))
+    chosen = choose_plan(plan, np.result_type(*(x.dtype for x in (log_obs, *chains))))
     for name, array in {"actions": actions, "start": start, "valid": valid}.items():
         if array.shape != log_obs.shape[:3]:
             raise ValueError(f"{name} must have shape {log_obs.shape[:3]} as log_obs, got {array.shape}")
