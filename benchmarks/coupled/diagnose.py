@@ -6,7 +6,7 @@
   window of trials that learning sees: the mutual information ``I(o'; r | o, a)`` that strand 1 has about
   where strand 0 goes next, and what the observations are worth under the coupled model and under the chain
   that acts, in nats per step.
-- *Exploration hides circles.* The share of trials that succeed in training, with exploration, and greedily; and
+- *Exploration hides circles.* The share of trials that succeed in training, exploring, and greedily; and
   whether the gate holds the model, which then learns no more.
 
 The controls: no return modelled (``theta = 0``); couplings frozen at even rows, where the strands are apart;

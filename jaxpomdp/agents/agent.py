@@ -19,21 +19,14 @@ from jaxpomdp.agents import best as keeping
 from jaxpomdp.agents import experience, learner
 from jaxpomdp.agents.best import Best
 from jaxpomdp.agents.clock import Clock
-from jaxpomdp.agents.control import ControlConfig, Schedule
+from jaxpomdp.agents.control import ControlConfig, settled
 from jaxpomdp.agents.experience import Experience
 from jaxpomdp.agents.kinds import FlatModel, Room, Sizes, roomier, started
 from jaxpomdp.agents.learner import LearnerConfig
+from jaxpomdp.agents.outcomes import joined, summarise
 from jaxpomdp.agents.trial import Actor, run_trials
 from jaxpomdp.envs.world import World
 from jaxpomdp.structure.policy import revise
-
-GREEDY = Schedule(0.0, 0.0, 1, "constant")
-"""Exploration while an agent is judged."""
-
-
-def settled(control: ControlConfig) -> ControlConfig:
-    """Return the settings of an agent that acts as it will in the end: greedily, and its values stay."""
-    return replace(control, schedule=GREEDY, exploration="epsilon", alpha=0.0)
 
 
 @dataclass(frozen=True)
@@ -336,30 +329,6 @@ def _note_evidence(edits: list[dict[str, Any]], before: np.ndarray, after: np.nd
     for row in edits:
         s = row["seed_index"]
         row |= {"log_evidence_before": float(before[s]), "log_evidence_after": float(after[s])}
-
-
-def summarise(trials: list[experience.Trials], world: World) -> dict[str, np.ndarray]:
-    """Return what trials came to: ``steps``, ``reward``, ``discounted``, ``success``, ``[S, trials]``."""
-    rows = [_summary(seed, world) for seed in trials]
-    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-
-
-def joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Lay the rows ``[S, trials]`` of :func:`summarise` side by side."""
-    names = ("steps", "reward", "discounted", "success")
-    return {name: np.concatenate([rows[name] for rows in parts], axis=1) for name in names}
-
-
-def _summary(trials: experience.Trials, world: World) -> dict[str, np.ndarray]:
-    begins = np.cumsum(trials.lengths) - trials.lengths
-    inside = np.arange(len(trials.rewards)) - np.repeat(begins, trials.lengths)
-    last_reward = trials.rewards[begins + trials.lengths - 2]
-    return {
-        "steps": trials.lengths - 1,
-        "reward": np.add.reduceat(trials.rewards, begins),
-        "discounted": np.add.reduceat(trials.rewards * world.discount**inside, begins),
-        "success": trials.terminated & (last_reward > world.success_above),
-    }
 
 
 def make_agent(name: str, world: World, **settings: Any) -> Agent:

@@ -6,7 +6,7 @@ The settings are static; what is carried is a ``Lane``: one agent in one world, 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -97,6 +97,15 @@ class ControlConfig:
             raise ValueError(f"rule must be 'sarsa' or 'q', got {self.rule!r}")
         if self.exploration not in ("epsilon", "boltzmann"):
             raise ValueError(f"exploration must be 'epsilon' or 'boltzmann', got {self.exploration!r}")
+
+
+GREEDY = Schedule(0.0, 0.0, 1, "constant")
+"""Exploration while an agent is judged."""
+
+
+def settled(control: ControlConfig) -> ControlConfig:
+    """Return the settings of an agent that acts as it will in the end: greedily, and its values stay."""
+    return replace(control, schedule=GREEDY, exploration="epsilon", alpha=0.0)
 
 
 @pytree

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxpomdp._types import Array
-from jaxpomdp.agents import agent as agents
 from jaxpomdp.agents import control, experience, learner
 from jaxpomdp.agents.agent import Agent, AgentConfig, AgentState
 from jaxpomdp.agents.best import none_yet
@@ -25,6 +24,7 @@ from jaxpomdp.agents.experience import Trials
 from jaxpomdp.agents.gym_play import play
 from jaxpomdp.agents.gym_turns import SingleTurns, VectorTurns, turns_of
 from jaxpomdp.agents.kinds import Sizes, started
+from jaxpomdp.agents.outcomes import joined, summarise
 from jaxpomdp.agents.trial import Actor, first_belief, memory_of, next_belief
 from jaxpomdp.envs.spaces import ChannelSpec, actions_of, channels_of, encode
 from jaxpomdp.models.init import Real
@@ -75,7 +75,7 @@ class _Learner(Agent):
     ) -> tuple[AgentState, dict[str, np.ndarray]]:
         """Remember new trials, and learn from the past where a phase is complete."""
         clock, was_blind = Clock(), self.blind(state)
-        rows = agents.summarise(new, self.world)
+        rows = summarise(new, self.world)
         state = state._replace(actor=actor, experience=experience.remember(state.experience, new))
         evidence = np.zeros(len(new))
         complete = int(np.max(np.asarray(actor.trials))) % self.config.learner.trials_per_phase == 0
@@ -185,18 +185,18 @@ class GymAgent:
             left, seed = left - rows["steps"].shape[1], None
             if progress:
                 progress(rows)
-        return agents.joined(phases)
+        return joined(phases)
 
     def evaluate(self, env: Any, trials: int, *, seed: int = 0) -> dict[str, np.ndarray]:
         """Act greedily without learning; rows as of ``train``. The environment is reset with ``seed``."""
         turns = self._turns(env, trials)
         self._check_copies(turns)
-        greedy = agents.settled(self._learner.config.control)
+        greedy = control.settled(self._learner.config.control)
         family, state = self._learner.family, self.state
         _, new = play(
             family, greedy, state.params, state.actor, turns, trials=trials, seed=seed, learning=False
         )
-        return agents.summarise(new, self._learner.world)
+        return summarise(new, self._learner.world)
 
     def finish(self) -> None:
         """Go back to the best policy so far where it is to be preferred (``learner.keep_best``)."""
@@ -231,7 +231,7 @@ class GymAgent:
         done = int(np.max(np.asarray(state.actor.trials))) % every
         rehearsing, blind = done >= every - rehearsals, self._learner.blind(state)
         trials = min(most, (every if rehearsing else every - rehearsals) - done)
-        acting = agents.settled(config.control) if rehearsing else config.control
+        acting = control.settled(config.control) if rehearsing else config.control
         if blind:
             acting = replace(config.control, schedule=RANDOM, exploration="epsilon", sticky=0.0)
         options = {"trials": trials, "seed": seed, "learning": not (blind or rehearsing)}

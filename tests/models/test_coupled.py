@@ -130,7 +130,7 @@ def test_brute_force_notices_a_broken_step() -> None:
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("coupling", ["mixture", "product"])
-@pytest.mark.parametrize("theta", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("theta", [0.0, pytest.param(0.2, marks=pytest.mark.slow), 1.0])
 def test_the_objective_never_falls(coupling: str, theta: float) -> None:
     """Priors, floors, structural zeros, spare states, carried statistics; 60 steps of two models."""
     family, params = FAMILIES[coupling], stack_models([start(coupling, seed) for seed in range(2)])
