@@ -310,3 +310,12 @@ def test_bad_arguments_are_named() -> None:
         native.coupled_estep(init, (trans[0], trans[0]), rows, actions, *flags)
     with pytest.raises(ValueError, match=r"log_obs\[1\] must be float32.*, got float16"):
         native.coupled_estep(init, trans, (rows[0], rows[1].astype(jnp.float16)), actions, *flags)
+
+
+@needs_native
+def test_chains_without_states_are_answered() -> None:
+    """They once ended the process: a division by zero."""
+    (init, trans), rows, *rest = stack_coupled(batch(1, 2, sizes=(3, 2)), np.float32)
+    none = (trans[0][:, :, :0, :, :0], trans[1][:, :, :0])
+    seen = native.coupled_estep((init[0][:, :0], init[1]), none, (rows[0][..., :0], rows[1]), *rest)
+    assert seen.gamma[0].shape == rows[0][..., :0].shape
