@@ -119,18 +119,16 @@ class CoupledWorker {
 
   // False: not trusted.
   bool forward() {
-    double evidence = 0, product = 1;
+    Evidence evidence;
     for (Index t = 0; t < T_; ++t) {
       const int32_t how = arrival(t);
       if (how == kPadding) continue;
       if (how >= 0) push(how, belief_ + (t - 1) * ld_);
       const float shift = observe(how >= 0 ? now_ : start_, t);
       if (!(norm_[t] >= kOverlapFloor)) return false;
-      evidence += shift < kImpossible ? kNeg : shift;
-      product *= norm_[t];
-      if (product < 1e-200) evidence += std::log(product), product = 1;
+      evidence.shift(shift), evidence.norm(norm_[t]);
     }
-    p_.evidence[tape_] = evidence + std::log(product);
+    p_.evidence[tape_] = evidence.total();
     return true;
   }
 

@@ -85,7 +85,7 @@ class MarginalWorker {
 
   void enter(Index unit) {
     first_tape_ = p_.first_row(unit), lanes_ = p_.rows(unit);
-    evidence_.assign(lanes_, 0.0), product_.assign(lanes_, 1.0);
+    evidence_.assign(lanes_, {});
     if (model_ == p_.model(unit)) return;
     model_ = p_.model(unit);
     for (int c = 0; c < 2; ++c) {
@@ -115,7 +115,7 @@ class MarginalWorker {
         for (int c = 0; c < 2 && arrival(lane, t) != kPadding; ++c) observe(lane, t, c);
     }
     for (Index lane = 0; lane < lanes_; ++lane)
-      p_.evidence[tape(lane)] = evidence_[lane] + std::log(product_[lane]);
+      p_.evidence[tape(lane)] = evidence_[lane].total();
   }
 
   static void multiply_group(Group& g, const float* matrix, Index ld, Index depth, Index vecs) {
@@ -144,7 +144,7 @@ class MarginalWorker {
     Vec best = splat(kNeg), total{};
     sweep(N, [&](Index n, Index count) { best = larger(best, within_reach(n, count)); });
     const float shift = peak(best);
-    evidence_[lane] += shift < kImpossible ? kNeg : shift;
+    evidence_[lane].shift(shift);
     if (shift < kImpossible) {
       std::memcpy(to, now, N * sizeof(float));
       std::fill_n(seen, N, 1.0f);
@@ -160,7 +160,7 @@ class MarginalWorker {
       sweep(N, [&](Index n, Index count) {
         store_first(to + n, count, load_first(now + n, count, 0) * load_first(seen + n, count, 0) / splat(norm));
       });
-      note(lane, norm);
+      evidence_[lane].norm(norm);
     } else {
       observe_in_double(lane, row, shift, now, to, N);
     }
@@ -172,12 +172,7 @@ class MarginalWorker {
     double norm = 0;
     for (Index n = 0; n < N; ++n) norm += joint[n] = now[n] > 0 ? now[n] * std::exp((double)row[n] - shift) : 0;
     for (Index n = 0; n < N; ++n) to[n] = joint[n] / norm;
-    note(lane, norm);
-  }
-
-  void note(Index lane, double norm) {
-    product_[lane] *= norm;
-    if (product_[lane] < 1e-200) evidence_[lane] += std::log(product_[lane]), product_[lane] = 1;
+    evidence_[lane].norm(norm);
   }
 
   void backward(const CoupledCounts& out) {
@@ -354,7 +349,7 @@ class MarginalWorker {
   Floats leaving_[2], arriving_;                   // [A, kBlock, ld]; [A, kBlock, row_ld]
   std::vector<Group> groups_, promised_;
   std::vector<Index> filled_;
-  std::vector<double> evidence_, product_;
+  std::vector<Evidence> evidence_;
 };
 
 }  // namespace

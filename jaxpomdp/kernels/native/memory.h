@@ -122,7 +122,7 @@ class MemoryWorker {
   void enter(Index unit) {
     lanes_ = p_.rows(unit), first_row_ = p_.first_row(unit) + p_.model(unit) * p_.B;
     failed_.assign(lanes_, false);
-    evidence_.assign(lanes_, 0.0);
+    evidence_.assign(lanes_, {});
     if (model_ == p_.model(unit)) return;
     model_ = p_.model(unit);
     wake();
@@ -220,8 +220,7 @@ class MemoryWorker {
 
   void forward() {
     const std::vector<Index> lanes = sound_lanes();
-    std::vector<double> product(lanes_, 1.0);
-    std::fill(evidence_.begin(), evidence_.end(), 0.0);
+    std::fill(evidence_.begin(), evidence_.end(), Evidence{});
     for (Index t = 0; t < T_; ++t) {
       for (Index lane : lanes)
         if (const int32_t how = arrival(lane, t); how >= 0) {
@@ -236,12 +235,9 @@ class MemoryWorker {
         if (how >= 0) heed_memory(how, pairs(lane), now(lane));
         const float shift = observe(how >= 0 ? now(lane) : start_ + 0, lane, t), norm = norm_[lane * T_ + t];
         if (!(norm >= kOverlapFloor)) failed_[lane] = true;
-        evidence_[lane] += shift < kImpossible ? kNeg : shift;
-        product[lane] *= norm;
-        if (product[lane] < 1e-200) evidence_[lane] += std::log(product[lane]), product[lane] = 1;
+        evidence_[lane].shift(shift), evidence_[lane].norm(norm);
       }
     }
-    for (Index lane : lanes) evidence_[lane] += std::log(product[lane]);
   }
 
   // Of those that remember an awake state, some moved by the chain, and some by that state's row.
@@ -288,7 +284,7 @@ class MemoryWorker {
         if (!step_back(lane, t, out)) failed_[lane] = true, fine = false;
     }
     for (Index a = 0; a < p_.A; ++a) count_any(a), count_own(a);
-    for (Index lane : lanes) p_.evidence[row(lane)] = evidence_[lane];
+    for (Index lane : lanes) p_.evidence[row(lane)] = evidence_[lane].total();
     return fine;
   }
 
@@ -489,7 +485,7 @@ class MemoryWorker {
   std::vector<Group> any_groups_, own_groups_;
   std::vector<Index> any_filled_, own_filled_;
   std::vector<char> failed_;
-  std::vector<double> evidence_;
+  std::vector<Evidence> evidence_;
   std::vector<const float*> rows_from_;
   std::vector<float*> rows_to_;
 };

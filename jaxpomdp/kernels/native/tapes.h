@@ -60,6 +60,17 @@ struct Group {
   void add(const float* x, float* out) { from[size] = x, to[size++] = out; }
 };
 
+// The log-evidence of a tape, taken in step by step: norms are multiplied, and their logarithm is taken now and then.
+struct Evidence {
+  double sum = 0, product = 1;
+  void shift(float log_density) { sum += log_density < kImpossible ? kNeg : log_density; }
+  void norm(double probability) {
+    product *= probability;
+    if (product < 1e-200) sum += std::log(product), product = 1;
+  }
+  double total() const { return sum + std::log(product); }
+};
+
 constexpr Index kBlock = 64;  // steps whose transitions are counted by one product
 
 // The rows of one time lie far apart, too many streams for the processor to foresee: fetch each a step ahead.
@@ -171,7 +182,7 @@ class Worker {
   void enter(Index unit) {
     model_ = p_.model(unit), first_row_ = p_.first_row(unit), lanes_ = p_.rows(unit);
     failed_.assign(lanes_, false);
-    evidence_.assign(lanes_, 0.0);
+    evidence_.assign(lanes_, {});
     for (Index lane = 0; lane < lanes_; ++lane)
       for (Index t = 0; t < T_; ++t) arrival_[t * lanes_ + lane] = p_.arrival(row(lane), t);
     std::memcpy(init_ + 0, p_.init + model_ * N_, N_ * sizeof(float));
@@ -210,8 +221,7 @@ class Worker {
 
   void forward() {
     const std::vector<Index> lanes = sound_lanes();
-    std::vector<double> product(lanes_, 1.0);
-    std::fill(evidence_.begin(), evidence_.end(), 0.0);
+    std::fill(evidence_.begin(), evidence_.end(), Evidence{});
     for (Index t = 0; t < T_; ++t) {
       for (Index lane : lanes) {
         const int32_t how = arrival(lane, t);
@@ -229,12 +239,9 @@ class Worker {
         Observed seen = observe(log_obs(lane, t), now_ + lane * ld_, belief(lane, t), N_);
         observed_[t * lanes_ + lane] = seen;
         if (!(seen.norm >= kOverlapFloor)) failed_[lane] = true;
-        evidence_[lane] += seen.shift < kImpossible ? kNeg : seen.shift;
-        product[lane] *= seen.norm;
-        if (product[lane] < 1e-200) evidence_[lane] += std::log(product[lane]), product[lane] = 1;
+        evidence_[lane].shift(seen.shift), evidence_[lane].norm(seen.norm);
       }
     }
-    for (Index lane : lanes) evidence_[lane] += std::log(product[lane]);
   }
 
   void write_norms(Index lane) {
@@ -259,7 +266,7 @@ class Worker {
         if (arrival(lane, t) != kPadding && !step_back(lane, t, initial)) failed_[lane] = true, fine = false;
     }
     for (Index a = 0; a < p_.A; ++a) count_block(a);
-    for (Index lane : lanes) p_.evidence[row(lane)] = evidence_[lane];
+    for (Index lane : lanes) p_.evidence[row(lane)] = evidence_[lane].total();
     return fine;
   }
 
@@ -309,7 +316,7 @@ class Worker {
   std::vector<int32_t> arrival_;
   std::vector<Index> filled_;
   std::vector<char> failed_;
-  std::vector<double> evidence_;
+  std::vector<Evidence> evidence_;
   std::vector<const float*> rows_from_;
   std::vector<float*> rows_to_;
 };
