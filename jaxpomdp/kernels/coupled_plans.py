@@ -70,18 +70,14 @@ def choose_plan(plan: str, chains: CoupledChain, log_obs: Rows = ()) -> str:
     Raises:
         ValueError: ``plan`` is not known or cannot run here.
     """
-    if plan not in PLANS:
-        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
     number = len(chains.log_init)
-    dtype = np.result_type(*(x.dtype for x in (*chains.log_init, *chains.log_trans, *log_obs)))
     if plan == "native" and number != 2:
         raise ValueError(f"plan 'native' needs two chains, got {number}")
-    fits = number == 2 and dtype == jnp.float32 and native.available()
-    if plan == "native" and not fits:
-        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {dtype.name}")
-    if plan == "auto":
-        return "native" if fits else "scan"
-    return plan
+    if plan == "auto" and number != 2:
+        return "scan"
+    dtype = np.result_type(*(x.dtype for x in (*chains.log_init, *chains.log_trans, *log_obs)))
+    chosen = native.resolved(plan, PLANS, dtype)
+    return "scan" if chosen == "auto" else chosen
 
 
 @partial(jax.jit, static_argnames="plan")

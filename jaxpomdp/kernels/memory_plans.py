@@ -86,14 +86,8 @@ def choose_plan(plan: str, dtype: Any) -> str:
     Raises:
         ValueError: ``plan`` is not known, or is ``native`` where that cannot run.
     """
-    if plan not in PLANS:
-        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    fits = dtype == jnp.float32 and native.available()
-    if plan == "native" and not fits:
-        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
-    if plan == "auto":
-        return "native" if fits else "awake"
-    return plan
+    chosen = native.resolved(plan, PLANS, dtype)
+    return "awake" if chosen == "auto" else chosen
 
 
 @partial(jax.jit, static_argnames="plan")

@@ -103,15 +103,9 @@ def choose_plan(plan: str, dtype: jnp.dtype, sizes: tuple[int, int, int, int]) -
     Raises:
         ValueError: ``plan`` is not known, or is ``native`` where that cannot run.
     """
-    if plan not in PLANS:
-        raise ValueError(f"plan must be one of {PLANS}, got {plan!r}")
-    fits = plan in ("auto", "native") and dtype == jnp.float32 and native.available()
-    if plan == "native" and not fits:
-        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
-    if plan != "auto":
-        return plan
-    if fits:
-        return "native"
+    chosen = native.resolved(plan, PLANS, dtype)
+    if chosen != "auto":
+        return chosen
     if jax.default_backend() == "cpu":
         return "grouped"
     costs = accelerator_seconds(*sizes)

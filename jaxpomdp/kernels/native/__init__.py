@@ -8,7 +8,11 @@ They use the cores that the process may run on, or as many threads as the enviro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
+import jax.numpy as jnp
 
 from jaxpomdp.kernels.native.build import loaded
 from jaxpomdp.kernels.native.control import Acted, ActingModel, WorldTables, act, sarsa_replay
@@ -25,6 +29,7 @@ __all__ = [
     "filter_tapes",
     "marginal_estep",
     "memory_estep",
+    "resolved",
     "sarsa_replay",
 ]
 
@@ -32,3 +37,22 @@ __all__ = [
 def available() -> bool:
     """Say whether the native kernels can be used here: JAX computes on the CPU, and the library was built."""
     return jax.default_backend() == "cpu" and loaded()
+
+
+def resolved(plan: str, plans: Sequence[str], dtype: Any) -> str:
+    """Return the plan, for ``auto`` ``native`` where it can run; elsewhere ``auto`` stays to be chosen.
+
+    Args:
+        plan: one of ``plans``.
+        plans: names of plans; ``auto`` and ``native`` are among them.
+        dtype: of the numbers.
+
+    Raises:
+        ValueError: ``plan`` is not known, or is ``native`` where that cannot run.
+    """
+    if plan not in plans:
+        raise ValueError(f"plan must be one of {plans}, got {plan!r}")
+    fits = plan in ("auto", "native") and dtype == jnp.float32 and available()
+    if plan == "native" and not fits:
+        raise ValueError(f"plan 'native' needs float32 on a CPU with a compiler, got {jnp.dtype(dtype).name}")
+    return "native" if fits else plan
