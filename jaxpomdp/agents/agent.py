@@ -20,10 +20,10 @@ from jaxpomdp.agents import experience, learner
 from jaxpomdp.agents.best import Best
 from jaxpomdp.agents.clock import Clock
 from jaxpomdp.agents.control import ControlConfig, settled
-from jaxpomdp.agents.experience import Experience
+from jaxpomdp.agents.experience import Experience, Trials
 from jaxpomdp.agents.kinds import FlatModel, Room, Sizes, roomier, started
 from jaxpomdp.agents.learner import LearnerConfig
-from jaxpomdp.agents.outcomes import joined, summarise
+from jaxpomdp.agents.outcomes import summarise
 from jaxpomdp.agents.trial import Actor, run_trials
 from jaxpomdp.envs.world import World
 from jaxpomdp.structure.policy import revise
@@ -119,31 +119,34 @@ class Agent:
             ``structure``, ``replaying`` (the same for all seeds).
         """
         clock = Clock()
-        actor, parts = self._act(state)
-        rows = joined([summarise(new, self.world) for new in parts])
+        actor, new = self._act(state)
+        rows = summarise(new, self.world)
         clock.lap("acting")
         state = self._noted(state._replace(actor=actor), rows["discounted"])
         state = self._judge(state, rows["discounted"].shape[1])
         evidence = np.zeros(len(state.recent))
         if self.config.learner:
-            for new in parts:
-                state = state._replace(experience=experience.remember(state.experience, new))
+            state = state._replace(experience=experience.remember(state.experience, new))
             state, evidence = self._learn(state, clock)
         return state, rows | self._phase_rows(state, evidence, clock)
 
-    def _act(self, state: AgentState) -> tuple[Actor, list[list[experience.Trials]]]:
+    def _act(self, state: AgentState) -> tuple[Actor, list[Trials]]:
         """Run the trials of a phase: those that explore, then the rehearsals if there are any."""
         settings, control = self.config.learner, self.config.control
         rehearsals = settings.rehearsals if settings else 0
         trials = (settings.trials_per_phase if settings else 50) - rehearsals
-        actor, parts = state.actor, []
-        for count, how in ((trials, control), (rehearsals, settled(control))):
-            if count:
-                actor, log, columns = run_trials(
-                    self.family, how, self.world, state.params, actor, trials=count
-                )
-                parts.append(experience.split_log(log, int(columns)))
-        return actor, parts
+        actor, new = self._trials(state.params, state.actor, control, trials)
+        if rehearsals:
+            actor, last = self._trials(state.params, actor, settled(control), rehearsals)
+            new = list(map(experience.chained, new, last))
+        return actor, new
+
+    def _trials(
+        self, params: Any, actor: Actor, control: ControlConfig, trials: int
+    ) -> tuple[Actor, list[Trials]]:
+        """Run trials of all seeds under some control settings."""
+        actor, log, count = run_trials(self.family, control, self.world, params, actor, trials=trials)
+        return actor, experience.split_log(log, int(count))
 
     def _phase_rows(self, state: AgentState, evidence: np.ndarray, clock: Clock) -> dict[str, np.ndarray]:
         level = self.config.control.schedule.function()(state.actor.steps)
@@ -309,9 +312,8 @@ class Agent:
         keys = of_seed(jnp.asarray(state.actor.keys)[:, -1])
         zero = jnp.zeros(len(keys), jnp.int32)
         actor = Actor(keys, state.actor.q, zero, zero)
-        control = settled(self.config.control)
-        _, log, count = run_trials(self.family, control, self.world, state.params, actor, trials=trials)
-        return summarise(experience.split_log(log, int(count)), self.world)
+        _, new = self._trials(state.params, actor, settled(self.config.control), trials)
+        return summarise(new, self.world)
 
     def finish(self, state: AgentState) -> AgentState:
         """Return the agent as it ends: where an earlier policy is to be preferred, that one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxpomdp._types import TrialBatch
@@ -77,19 +78,21 @@ def of_seed(store: Experience, s: int) -> Trials:
     )
 
 
+def chained(old: Trials, new: Trials) -> Trials:
+    """Return the trials of one seed, and after them its new ones."""
+    return jax.tree.map(lambda *x: np.concatenate(x), old, new)
+
+
 def _extended(store: Experience, s: int, new: Trials) -> Trials:
-    old = of_seed(store, s)
-    window = store.lengths.shape[1]
-    lengths = np.concatenate([old.lengths, new.lengths])
-    dropped = int(lengths[: max(len(lengths) - window, 0)].sum())
-    join = lambda a, b: np.concatenate([a, b])  # noqa: E731
+    window, trials = store.lengths.shape[1], chained(of_seed(store, s), new)
+    dropped = int(trials.lengths[: max(len(trials.lengths) - window, 0)].sum())
     return Trials(
-        lengths[-window:],
-        join(old.terminated, new.terminated)[-window:],
-        join(old.tail, new.tail)[-window:],
-        tuple(join(a, b)[dropped:] for a, b in zip(old.observations, new.observations, strict=True)),
-        join(old.actions, new.actions)[dropped:],
-        join(old.rewards, new.rewards)[dropped:],
+        trials.lengths[-window:],
+        trials.terminated[-window:],
+        trials.tail[-window:],
+        tuple(channel[dropped:] for channel in trials.observations),
+        trials.actions[dropped:],
+        trials.rewards[dropped:],
     )
 
 

@@ -24,7 +24,7 @@ from jaxpomdp.agents.experience import Trials
 from jaxpomdp.agents.gym_play import play
 from jaxpomdp.agents.gym_turns import SingleTurns, VectorTurns, turns_of
 from jaxpomdp.agents.kinds import Sizes, started
-from jaxpomdp.agents.outcomes import joined, summarise
+from jaxpomdp.agents.outcomes import summarise
 from jaxpomdp.agents.trial import Actor, first_belief, memory_of, next_belief
 from jaxpomdp.envs.spaces import ChannelSpec, actions_of, channels_of, encode
 from jaxpomdp.models.init import Real
@@ -185,7 +185,7 @@ class GymAgent:
             left, seed = left - rows["steps"].shape[1], None
             if progress:
                 progress(rows)
-        return joined(phases)
+        return _joined(phases)
 
     def evaluate(self, env: Any, trials: int, *, seed: int = 0) -> dict[str, np.ndarray]:
         """Act greedily without learning; rows as of ``train``. The environment is reset with ``seed``."""
@@ -193,9 +193,7 @@ class GymAgent:
         self._check_copies(turns)
         greedy = control.settled(self._learner.config.control)
         family, state = self._learner.family, self.state
-        _, new = play(
-            family, greedy, state.params, state.actor, turns, trials=trials, seed=seed, learning=False
-        )
+        _, new = play(family, greedy, state.params, state.actor, turns, trials=trials, seed=seed)
         return summarise(new, self._learner.world)
 
     def finish(self) -> None:
@@ -233,9 +231,9 @@ class GymAgent:
         trials = min(most, (every if rehearsing else every - rehearsals) - done)
         acting = control.settled(config.control) if rehearsing else config.control
         if blind:
-            acting = replace(config.control, schedule=RANDOM, exploration="epsilon", sticky=0.0)
-        options = {"trials": trials, "seed": seed, "learning": not (blind or rehearsing)}
-        actor, new = play(self._learner.family, acting, state.params, state.actor, turns, **options)
+            acting = replace(control.settled(config.control), schedule=RANDOM, sticky=0.0)
+        family = self._learner.family
+        actor, new = play(family, acting, state.params, state.actor, turns, trials=trials, seed=seed)
         self.state, rows = self._learner.take_in(state, actor, new)
         self._belief = None
         return rows
@@ -270,3 +268,8 @@ def _spaces_of(env: Any) -> tuple[Any, Any]:
 
 def _described(channel: ChannelSpec) -> str:
     return f"{channel.name}: {channel.size} {'values' if channel.kind == 'categorical' else 'real numbers'}"
+
+
+def _joined(phases: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    names = ("steps", "reward", "discounted", "success")
+    return {name: np.concatenate([rows[name] for rows in phases], axis=1) for name in names}

@@ -23,7 +23,7 @@ def _memories(family: Family, params: Any) -> Memory:
     return jax.vmap(partial(memory_of, family))(params)
 
 
-@partial(jax.jit, static_argnames=("family", "config", "learning"))
+@partial(jax.jit, static_argnames=("family", "config"))
 def _react(
     family: Family,
     config: ControlConfig,
@@ -33,8 +33,6 @@ def _react(
     turn: Turn,
     trial: Array,
     t: Array,
-    *,
-    learning: bool,
 ) -> tuple[Lane, Array]:
     """Take in one turn of every copy: learn from an outcome or begin a trial, and choose an action."""
 
@@ -43,7 +41,7 @@ def _react(
             jax.random.fold_in(jax.random.fold_in(key, trial), t), (control.UNIFORMS_PER_CHOICE,)
         )
         belief = next_belief(family, memory, lane.belief, lane.action, turn.observations)
-        rate = jnp.float32(config.alpha if learning else 0)
+        rate = jnp.float32(config.alpha)
         outcome = (turn.reward, turn.terminated, turn.ended)
         acted, best = control.learn(config, lane, belief, *outcome, uniforms, rate)
         begun = control.begin(config, lane, first_belief(family, memory, turn.observations), uniforms)
@@ -62,7 +60,6 @@ def play(
     *,
     trials: int,
     seed: int | None = None,
-    learning: bool = True,
 ) -> tuple[Actor, list[Trials]]:
     """Let every copy run ``trials`` trials; one that has done them waits. See ``trial.run_trials``.
 
@@ -81,9 +78,7 @@ def play(
         for turn in coming:
             turn = turn._replace(kind=np.where(done < trials, turn.kind, IDLE))
             t = np.where(turn.kind == BEGAN, 0, t + 1).astype(np.int32)
-            lane, best = _react(
-                family, config, memory, actor.keys, lane, turn, before + done, t, learning=learning
-            )
+            lane, best = _react(family, config, memory, actor.keys, lane, turn, before + done, t)
             seen.append(turn)
             reactions.append(Reaction(np.asarray(lane.action), np.asarray(best)))
             done = done + (turn.ended & (turn.kind == ACTED))

@@ -14,12 +14,6 @@ def summarise(trials: list[Trials], world: World) -> dict[str, np.ndarray]:
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
-def joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Lay the rows ``[S, trials]`` of :func:`summarise` side by side."""
-    names = ("steps", "reward", "discounted", "success")
-    return {name: np.concatenate([rows[name] for rows in parts], axis=1) for name in names}
-
-
 def _summary(trials: Trials, world: World) -> dict[str, np.ndarray]:
     begins = np.cumsum(trials.lengths) - trials.lengths
     inside = np.arange(len(trials.rewards)) - np.repeat(begins, trials.lengths)

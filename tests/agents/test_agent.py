@@ -142,15 +142,16 @@ def test_rehearsals_come_last_are_greedy_and_teach_no_values():
     agent = small(rehearsals=2, schedule=Schedule(1.0, 1.0, 1, "constant"))
     state = agent.init(SEEDS)
     state = state._replace(actor=replace(state.actor, q=state.actor.q.at[..., 2].set(50)))
-    actor, (explored, rehearsed) = agent._act(state)
+    actor, new = agent._act(state)
     free = run_trials(agent.family, agent.config.control, WORLD, state.params, state.actor, trials=4)[0]
     np.testing.assert_array_equal(actor.q, free.q)
     np.testing.assert_array_equal(actor.trials, 6)
-    for some, others in zip(explored, rehearsed, strict=True):
-        assert (len(some.lengths), len(others.lengths)) == (4, 2)
-        made = np.delete(others.actions, np.cumsum(others.lengths) - 1)
+    for trials in new:
+        assert len(trials.lengths) == 4 + 2
+        explored, rehearsed = np.split(trials.actions, [trials.lengths[:4].sum()])
+        made = np.delete(rehearsed, np.cumsum(trials.lengths[4:]) - 1)
         assert (made == 2).all()
-        assert not (some.actions == 2).all()
+        assert not (explored == 2).all()
     after, rows = agent.run(state)
     assert rows["steps"].shape == (3, 6)
     np.testing.assert_array_equal(after.experience.lengths[:, -6:] - 1, rows["steps"])
