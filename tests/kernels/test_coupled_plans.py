@@ -16,7 +16,7 @@ from jaxpomdp.numerics import NEG
 from tests.kernels.coupled_problems import CoupledProblem, random_coupled, stack_coupled
 from tests.kernels.problems import quick_jit
 from tests.kernels.test_coupled import as_batch, contradicting
-from tests.kernels.test_native import Tapes, by_numpy
+from tests.kernels.test_native import Tapes, by_numpy, by_threads
 
 needs_native = pytest.mark.skipif(not native.available(), reason="needs a compiler for the native kernels")
 by_scan = quick_jit(partial(coupled_posterior, plan="scan"))
@@ -143,12 +143,9 @@ def test_what_lies_in_the_padding_does_not_matter(by_native) -> None:
 @either_native
 def test_results_do_not_depend_on_the_number_of_threads(by_native, monkeypatch: pytest.MonkeyPatch) -> None:
     inputs = stack_coupled(batch(3, 11, sizes=(9, 5), steps=30), np.float32)
-    results = []
-    for threads in (1, 2, 5):
-        monkeypatch.setenv("JAXPOMDP_THREADS", str(threads))
-        results.append(by_native(*inputs))
-    assert_same(results[0], results[1], rtol=0, atol=0)
-    assert_same(results[0], results[2], rtol=0, atol=0)
+    one, *more = by_threads(lambda: by_native(*inputs), monkeypatch)
+    for other in more:
+        assert_same(one, other, rtol=0, atol=0)
 
 
 @needs_native

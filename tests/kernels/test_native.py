@@ -3,9 +3,10 @@ from __future__ import annotations
 import os
 import stat
 import subprocess
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -116,6 +117,15 @@ def numpy_trial(
         joint = forward[t] + after
         gamma[t] = np.exp(joint - np.logaddexp.reduce(joint))
     return evidence, gamma, xi
+
+
+def by_threads(call: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return what a call gives with one thread, with two and with five."""
+    results = []
+    for threads in (1, 2, 5):
+        monkeypatch.setenv("JAXPOMDP_THREADS", str(threads))
+        results.append(call())
+    return results
 
 
 def assert_same(got: Posterior, want: Posterior, **close: float) -> None:
@@ -261,12 +271,9 @@ def test_it_works_inside_jit_vmap_and_loops() -> None:
 @needs_native
 def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     tapes = draw(3, 40, 30, 20, 4)
-    results = []
-    for threads in (1, 2, 5):
-        monkeypatch.setenv("JAXPOMDP_THREADS", str(threads))
-        results.append(native.estep(*tapes))
-    assert_same(results[0], results[1], rtol=0, atol=0)
-    assert_same(results[0], results[2], rtol=0, atol=0)
+    one, *more = by_threads(lambda: native.estep(*tapes), monkeypatch)
+    for other in more:
+        assert_same(one, other, rtol=0, atol=0)
 
 
 @needs_native
